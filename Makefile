@@ -10,14 +10,14 @@ TORCH ?= torch==2.13.0
 PORT ?= 3000
 UI_WORKSPACE := $(abspath $(if $(TRAPS_WORKSPACE),$(TRAPS_WORKSPACE),$(DEMO)))
 
-.PHONY: help demo demo-mechanism check fast-tests test promises campaign cluster-setup ui lint setup setup-core docs render-packages browser test-packages clean
+.PHONY: help demo demo-mechanism check fast-tests test promises campaign cluster-setup ui lint setup setup-core setup-without-torch docs render-packages browser test-packages clean
 
 help: ## what make can do here
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' Makefile | expand -t 22
 	@printf '\nfor maintainers (maintainers.mk):\n'
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1\t\2/p' maintainers.mk | expand -t 22
 
-demo: setup-core ## leaderboard of nine models on 32 scenarios and one of two events, no key needed
+demo: setup-core ## leaderboard of nine reference strategies on 32 scenarios and one of two events, no key needed
 	TRAPS_WORKSPACE=$(DEMO) $(BIN)/traps run demo
 
 demo-mechanism: setup ## the pocket model from hidden states to steering, on the CPU, no key needed
@@ -55,7 +55,7 @@ campaign: test-packages cluster-setup ## everything else, in full or SHARD=2/6 o
 
 cluster-setup: test-packages setup $(VENV)/.cluster
 
-ui: setup ## Dagster's web server and daemon on 127.0.0.1; open the address that it prints
+ui: setup-without-torch ## Dagster's web server and daemon on 127.0.0.1; open the address that it prints
 	test -f $(UI_WORKSPACE)/study.yaml || TRAPS_WORKSPACE=$(UI_WORKSPACE) $(BIN)/traps init demo
 	TRAPS_WORKSPACE=$(UI_WORKSPACE) DAGSTER_HOME=$(UI_WORKSPACE)/dagster $(BIN)/traps ui --port $(PORT)
 
@@ -68,6 +68,8 @@ lint: setup
 
 setup: render-packages $(VENV)/.installed ## everything that `make check` needs
 
+setup-without-torch: render-packages $(VENV)/.without-torch ## what calls over the network and pages want
+
 setup-core: render-packages $(VENV)/.core ## what the demo wants: no torch, no provider's library, no web server
 
 # The pip that comes with Python 3.11 looks twice as long for so many packages; where this one cannot be had, that one does.
@@ -79,10 +81,14 @@ define compile
 $(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true
 endef
 
-$(VENV)/.installed: requirements.lock pyproject.toml hatch_build.py traps_soft_bodies/pyproject.toml
+$(VENV)/.installed: $(VENV)/.without-torch
+	$(PIP_INSTALL) $(TORCH)
+	$(compile)
+	touch $@
+
+$(VENV)/.without-torch: requirements.lock pyproject.toml hatch_build.py traps_soft_bodies/pyproject.toml
 	$(make-venv)
 	$(PIP_INSTALL) --no-deps --require-hashes -r requirements.lock
-	$(PIP_INSTALL) $(TORCH)
 	$(PIP_INSTALL) --no-deps --no-build-isolation --editable . --editable ./traps_soft_bodies
 	$(compile)
 	touch $(VENV)/.core $@

@@ -13,7 +13,10 @@ test-newest: render-packages ## the newest libraries that pyproject.toml admits:
 	$(compile)
 	$(BIN)/python -m pip --disable-pip-version-check list
 	$(BIN)/traps models check
+	$(BIN)/traps doctor --local
 	$(PYTEST) -n auto $(FAST) --any-cpu # newer libraries may import longer
+	$(PIP_INSTALL) --upgrade transformers # beyond the range: may it be widened?
+	$(BIN)/traps doctor --local
 
 # A number to look at, no threshold: what only slow tests reach counts as not reached.
 coverage: setup ## lines and branches of the package that the fast tests reach, by room and in all

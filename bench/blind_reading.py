@@ -111,15 +111,14 @@ def scored(answers: pd.DataFrame, key: pd.DataFrame, specs: dict[str, TwoEventsS
             is_right.append(answer.lower() == UNKNOWN and pd.isna(row["truth"]))
         else:
             is_right.append(bool(is_correct(answer, row["truth"], spec.answer_type, spec.labels, spec.aliases)))
-    sides = read["truth"].isna().map({True: "void", False: "control"})
-    return read.assign(right=is_right, family=families, side=sides)
+    return read.assign(right=is_right, family=families, side=np.where(read["truth"].isna(), "void", "control"))
 
 
 def print_scores(read: pd.DataFrame) -> None:
     print(f"right: {read['right'].mean():.3f} of {len(read)}")
     print(read.groupby("side")["right"].agg(["mean", "size"]).round(3).to_string())
     wrong = read.loc[~read["right"], ["number", "item_id", "truth", "answer"]]
-    print(read.groupby("family")["right"].mean().round(2).sort_values().to_string())
+    print(read.pivot_table(values="right", index="family").round(2).to_string())
     print(wrong.to_string(index=False) if len(wrong) else "none wrong")
 
 

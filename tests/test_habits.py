@@ -72,7 +72,7 @@ def test_a_tag_that_is_another_version_and_a_placeholder_that_is_left_stop_a_rel
     assert another.returncode != 0
     checkout, changelog, *placeholders = [line for line in another.stderr.splitlines() if not line.startswith("make")]
     assert f"v{version}" in checkout and "v0.0.1" in checkout and "CHANGELOG.md" in changelog
-    assert {line.partition(":")[0] for line in placeholders} == {"pyproject.toml", "SECURITY.md", ".github/CODEOWNERS"}
+    assert {line.partition(":")[0] for line in placeholders} == {*TO_FILL}
     assert checkout not in make(ROOT, "release-check", f"TAG=v{version}").stderr
 
 

@@ -18,7 +18,7 @@ from packaging.version import InvalidVersion, Version
 
 ROOT = Path(__file__).resolve().parents[1]
 PLACEHOLDERS = re.compile(r"OWNER|host\.invalid|SECURITY-ADDRESS")
-TO_FILL = ("pyproject.toml", "SECURITY.md", ".github/CODEOWNERS")
+TO_FILL = ("README.md", "pyproject.toml", "SECURITY.md", ".github/CODEOWNERS")
 
 
 def run(*command: str) -> str:

@@ -54,7 +54,7 @@ def test_a_wrong_name_in_an_experiment_is_one_sentence_and_leaves_no_workspace(
     code = main(["run", str(tmp_path / "x.yaml"), "--workspace", str(tmp_path / "study")])
     (sentence,) = capsys.readouterr().err.splitlines()
     assert code == 1
-    assert "[a-z0-9.-]+" in sentence and sentence.count("x.yaml: ") == 1
+    assert "[a-z0-9.-]+" in sentence and sentence.count("x.yaml:") == 1
     assert not (tmp_path / "study").exists()
 
 

@@ -12,6 +12,7 @@ from traps_pipeline.protocol.datasets import (
     CATEGORIES,
     DATASETS,
     EXTENSION_CATEGORIES,
+    RECORDED_CATEGORIES,
     UNPAIRED,
     datasets_of_category,
     is_ill_posed,
@@ -64,8 +65,8 @@ def test_a_wrong_key_is_refused(of: type[Cell | Evaluation], by: str, keys: list
 
 
 def test_an_extension_is_no_category_of_the_benchmark_and_its_voids_are_those_of_a_panel() -> None:
-    assert not set(EXTENSION_CATEGORIES) & set(CATEGORIES)
-    assert (*CATEGORIES, *EXTENSION_CATEGORIES) == ALL_CATEGORIES
+    assert not {*EXTENSION_CATEGORIES, *RECORDED_CATEGORIES} & {*CATEGORIES}
+    assert (*CATEGORIES, *EXTENSION_CATEGORIES, *RECORDED_CATEGORIES) == ALL_CATEGORIES
     assert {datasets_of_category(name) for name in EXTENSION_CATEGORIES} == {("occlusion", "occlusion_ill_posed")}
     assert datasets_of_category("hidden") == ("occlusion", "occlusion_ill_posed")
     assert datasets_of_category("plinko") == ("chaotic", "chaotic_ill_posed")

@@ -8,12 +8,17 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import BaseModel, ValidationError
 
 from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import read_lines, read_yaml
-from traps_pipeline.pipeline.experiment import load_experiment
+from traps_pipeline.base.yamlfile import explain, read_lines, read_yaml
+from traps_pipeline.models.registry.accounts import Account, Prices
+from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.user_registry import UserRegistry
+from traps_pipeline.pipeline.experiment import Experiment, load_experiment
+from traps_pipeline.storage.study import MechanismSettings, Study
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -95,6 +100,55 @@ def test_an_ambiguous_line_is_named(file: Path, line: str) -> None:
     with raises(TrapsError, "base.yamlfile.check_line", "file.yaml:2") as raised:
         next(lines)
     assert len(str(raised.value)) < 400 + len(str(file))
+
+
+MODEL = """models:
+  - id: my-model
+    base_url: http://127.0.0.1:9/v1
+    media: images
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "near"),
+    [
+        (f"name: a\npanel: rules\nscenarios: []\n{MODEL}", 3, ""),
+        (f"name: a\npanel: rules\nscenarios: [plinko-0001, plinko_0002]\n{MODEL}", 3, "plinko-0002"),
+        (f"name: a\npanel: rulez\n{MODEL}", 2, "rules"),
+        (f"name: a\n{MODEL}    serverd_name: x\n", 6, "served_name"),
+        (f"name: a\n{MODEL}    limits:\n      concurency: 3\n", 7, "concurrency"),
+        (f"name: a\n{MODEL}  - orcale\n", 6, "oracle"),
+        (f"name: a\nruns: 3\n{MODEL}", 2, ""),
+        (f"name: a\n{MODEL}  - 5\n", 6, ""),
+        ("name: a\npanel: rules\n", 1, ""),
+        ("[]", 1, ""),
+    ],
+)
+def test_a_fault_is_blamed_on_its_file_and_line_with_the_word_that_was_meant(
+    text: str, line: int, near: str, file: Path
+) -> None:
+    file.write_text(text)
+    with raises(TrapsError, "", f"{file}:{line}: ") as refused:
+        load_experiment(str(file))
+    assert re.findall(r"did you mean ([\w-]+)\?", str(refused.value)) == ([near] if near else [])
+    file.write_text("")
+    with raises(TrapsError, "", f"{file}: "):
+        load_experiment(str(file))
+
+
+@pytest.mark.parametrize("kind", [Experiment, Study, ModelEntry, Account, MechanismSettings, UserRegistry, Prices])
+def test_no_sentence_of_the_validator_reaches_a_person(kind: type[BaseModel]) -> None:
+    wrong = (None, "", "x y", 3, -1, -1.5, True, [], [5], {}, {"a": 1}, [[]], [{}])
+    n_refused = 0
+    for fields in [None, [], *({name: value} for name in kind.model_fields for value in wrong)]:
+        try:
+            kind.model_validate(fields, context={"accounts": {}})
+        except ValidationError as error:
+            text, n_refused = explain(error, kind), n_refused + 1
+            own = [details["msg"] for details in error.errors() if details["type"] != "value_error"]
+            assert text and not any(sentence in text for sentence in own), f"{fields}: {text}"
+            assert "{" not in re.sub(r"not [\[{'].*", "", text), text  # a gap that nothing fills
+    assert n_refused > len(kind.model_fields)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ class Answering:
     """A backend that counts calls and does what the test says: answers after a while, or raises."""
 
     def __init__(
-        self, says: Callable[[Request, int], Outcome | Exception] = lambda *_: LEFT, after_s: float = 0.0
+        self, says: Callable[[Request, int], Outcome | BaseException] = lambda *_: LEFT, after_s: float = 0.0
     ) -> None:
         self.calls: list[str] = []
         self.moments: list[float] = []
@@ -39,7 +39,7 @@ class Answering:
         self.moments.append(time.monotonic())
         await asyncio.sleep(0)
         said = self._says(request, self.calls.count(item))
-        if isinstance(said, Exception):
+        if isinstance(said, BaseException):
             raise said
         await asyncio.sleep(self._after_s)
         return said

@@ -16,7 +16,9 @@ def committed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from traps_pipeline.benchmark.composition import sample_benchmark
 
     def make(folder: Path) -> str:
-        sample_benchmark(folder / "private", {"hidden_drop": 1}, 2026, "private", look=["size"], workers=1)
+        sample_benchmark(
+            folder / "private", {"hidden_drop": 1}, 4702163958821407365, "private", look=["size"], workers=1
+        )
         files = ("--out", folder / "commitment.json", "--reveal", folder / "reveal.json")
         assert main(["benchmark", "commit", *map(str, (folder / "private", *files))]) == 0
         return ""

@@ -11,15 +11,14 @@ import pandas as pd
 from traps_pipeline.mechanism.control_rows import (
     GATE,
     ITEM_SCORES,
+    LEADS,
     LENS,
     PATCHING,
     PROBE_BASELINES,
-    RISK_COVERAGE,
     SENTENCES,
     STEERING_NULLS,
 )
-from traps_pipeline.mechanism.effects import own_effects
-from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS
+from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.storage.tables import Table
 
@@ -34,8 +33,7 @@ def probes() -> pd.DataFrame:
     sides = {"n_voids": 16, "n_controls": 16, "layer": 3, "chosen": True, "own_best": True}
     rows = [
         {"analysis": a, "source": s, "target": t, "value": 0.98, "low": 0.79, "high": 1.0} | sides
-        for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"),
-                        ("chaotic", "chaotic_time_swapped", "time_swapped"))
+        for s, t, a in (("chaotic", "chaotic", "held_out"), ("chaotic", "occlusion", "transfer"))
     ]  # fmt: skip
     guided = rows[0] | {"prompt": "guided", "value": 0.96}
     return frame(PROBES, *rows, rows[0] | {"layer": 1, "chosen": False, "value": 0.2}, guided)
@@ -43,11 +41,24 @@ def probes() -> pd.DataFrame:
 
 def baselines() -> pd.DataFrame:
     rows = []
-    for analysis, target in (("held_out", "chaotic"), ("time_swapped", "chaotic_time_swapped")):
+    for analysis, target in (("held_out", "chaotic"),):
         for features, value in (("time stamps", 1.0), ("output margin", 0.9), ("noise", 0.5)):
             row = {"analysis": analysis, "source": "chaotic", "target": target, "features": features, "value": value}
             rows.append(row | {"spread": 0.1 if features == "noise" else None})
     return frame(PROBE_BASELINES, *rows)
+
+
+def leads() -> pd.DataFrame:
+    """States lead the best rival by .2; the network with random weights has .15 more than its own, a placebo .05."""
+    rows = []
+    for subject, states, rival in (("model", 0.9, 0.7), ("random_0", 0.65, 0.5), ("length_matched", 0.55, 0.5)):
+        at = {"subject": subject, "target": "chaotic", "n_voids": 16, "n_controls": 16, "layer": -1}
+        own = {"features": "states", "auroc": states, "low": 0.5, "high": 1.0, "layer": 3, "rival": "question words"}
+        own |= {"lead": states - rival, "lead_low": 0.05, "lead_high": 0.3}
+        others = {"states, residual": 0.8, "question words": rival, "output margin": rival - 0.1}
+        others["first-token logits"] = rival - 0.05
+        rows += [at | own, *(at | {"features": name, "auroc": value} for name, value in others.items())]
+    return frame(LEADS, *rows)
 
 
 def gate() -> pd.DataFrame:
@@ -59,11 +70,6 @@ def gate() -> pd.DataFrame:
     rows = [row | {"features": features, "target": target} for features, target in kinds]
     short = at | {"features": "states", "target": "length_matched", "false_abs": 0.4, "n_controls": 8, "n_voids": 0}
     return frame(GATE, *rows, short)
-
-
-def curves() -> pd.DataFrame:
-    point = {"regime": "guided", "coverage": 0.5, "risk": 0.2, "n": 5}
-    return frame(RISK_COVERAGE, *(point | {"features": name} for name in ("states", "no gate")))
 
 
 def patching() -> pd.DataFrame:
@@ -78,7 +84,8 @@ def item_scores() -> pd.DataFrame:
     """Two voids, both answered: states rank them above both controls, the output between them."""
     scored = (("void", 2.0, -3.0), ("void", 1.0, -1.0), ("control", -1.0, -2.0), ("control", -4.0, -4.0))
     about = {"dataset": "chaotic", "abstained_standard": False}
-    rows = [about | {"item_id": str(n), "side": s, "own": own, "margin": m} for n, (s, own, m) in enumerate(scored)]
+    rows = [about | {"item_id": str(n), "side": s, "own": own, "others": own, "margin": m}
+            for n, (s, own, m) in enumerate(scored)]  # fmt: skip
     return frame(ITEM_SCORES, *rows)
 
 
@@ -101,7 +108,19 @@ def lens() -> pd.DataFrame:
 def nulls() -> pd.DataFrame:
     row = {"directions": "guided", "regime": "guided", "target": "chaotic", "layer": 3, "unit": "gap", "dose": 1.0}
     row |= {"side": "control", "null": "isotropic", "effect": 0.8, "null_mean": 0.1, "null_lowest": 0.0}
-    return frame(STEERING_NULLS, row | {"null_highest": 0.3, "draws": 20, "n_at_least": 0, "p": 1 / 21, "n": 5})
+    return frame(
+        STEERING_NULLS,
+        row
+        | {
+            "null_highest": 0.3,
+            "draws": 20,
+            "n_at_least": 0,
+            "p": 1 / 21,
+            "n": 5,
+            "undecided": 0.2,
+            "null_undecided": 0.1,
+        },
+    )
 
 
 def effects() -> pd.DataFrame:
@@ -124,10 +143,11 @@ class Made(Results):
     prompted_probes = cached_property(lambda _: probes())
     prompted_baselines = cached_property(lambda _: baselines())
     gate = cached_property(lambda _: gate())
-    risk_coverage = cached_property(lambda _: curves())
     patching = cached_property(lambda _: patching())
     item_scores = cached_property(lambda _: item_scores())
+    leads = cached_property(lambda _: leads())
+    cosines = cached_property(lambda _: frame(COSINES))
+    effects = cached_property(lambda _: effects())
     lens = cached_property(lambda _: lens())
     sentences = cached_property(lambda _: sentences())
     nulls = cached_property(lambda _: nulls())
-    own_effects = cached_property(lambda _: own_effects(effects()))

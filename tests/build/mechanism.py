@@ -14,7 +14,7 @@ from traps_pipeline.mechanism.mechanism_rows import DIRECTIONS, HIDDEN_STATES, P
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.cells import Extraction, StatesCell
-from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS
 from traps_pipeline.storage.workspace import Workspace
 
 STANDARD = Extraction("tiny", "standard")
@@ -33,11 +33,15 @@ def entry(patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -
     return made
 
 
-def extract_all(workspace: Workspace, datasets: Sequence[str] = (*DATASETS, ANSWERABLE, TIME_SWAPPED)) -> int:
+def extract_all(
+    workspace: Workspace,
+    datasets: Sequence[str] = (*DATASETS, ANSWERABLE),
+    extraction: Extraction = STANDARD,
+) -> int:
     made = 0
     for dataset in datasets:
         workspace.tables.write(PROBE_ITEMS, {"dataset": dataset}, probe_items(workspace, dataset), {})
-        cell = StatesCell(dataset, STANDARD)
+        cell = StatesCell(dataset, extraction)
         rows, new = stages.extract_states(workspace, cell)
         workspace.tables.write(HIDDEN_STATES, cell.partition, rows, {})
         made += new
@@ -48,7 +52,7 @@ def extract_all(workspace: Workspace, datasets: Sequence[str] = (*DATASETS, ANSW
 def study(entry: ModelEntry, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """Extracted, with directions."""
     workspace = make_study(tmp_path_factory.mktemp("study"))
-    assert extract_all(workspace) == 4 * 2 * PAIRS + PAIRS + 2 * PAIRS
+    assert extract_all(workspace) == 4 * 2 * PAIRS + PAIRS
     workspace.tables.write(DIRECTIONS, STANDARD.partition, stages.direction_rows(workspace, STANDARD), {})
     return workspace
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import datetime
+import json
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -238,6 +240,32 @@ def test_a_run_stops_at_a_model_that_is_not_checked_unless_it_is_told_to_go_on(
     assert f"{NAME}: not checked" in stopped.err and "--unchecked" in stopped.err and not unasked.ledger_rows("answers")
     unasked.traps("run", path, "--until", "responses", "--unchecked").ok()
     assert len(unasked.ledger_rows("answers")) == ITEMS
+
+
+def test_a_plan_has_the_minutes_of_the_calls_that_the_live_check_made(
+    unasked: Checkout, provider: Provider, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = experiment(unasked, provider, [network_entry(NAME, "images")], regimes=["standard"], budget_usd=50.0)
+    provider.configure(latency_s=3.0)
+    unasked.traps("models", "check", path, "--live").ok()
+    (row,) = json.loads(unasked.traps("plan", path, "--json").ok().out)["plan"]["forecasts"]
+    # 48 calls, 24 at once, of 3 s and little more; one at a time, the two calls of the check came 1.5 s apart
+    assert 2 * 3.0 <= row["minutes"] * 60 < 2 * 6.0
+    assert ITEMS * 1.5 <= row["queued_minutes"] * 60 < ITEMS * 3.0
+
+
+@pytest.mark.parametrize(("regimes", "asked"), [(["standard"], 0), (["standard", "json"], 1)])
+def test_a_model_is_tried_with_a_schema_only_if_the_run_asks_for_one(
+    unasked: Checkout, provider: Provider, regimes: list[str], asked: int
+) -> None:
+    provider.configure(unstructured=[NAME])
+    path = experiment(unasked, provider, [network_entry(NAME, "images")], regimes=regimes, budget_usd=50.0)
+    for command in (("models", "check", path, "--live"), ("run", path, "--until", "responses")):
+        provider.reset()
+        assert unasked.traps(*command).code == asked
+        bodies = [request["body"] for request in provider.requests() if request["body"]]
+        assert bodies and sum("response_format" in body for body in bodies) == asked
 
 
 @pytest.mark.parametrize(("typed", "code"), [("n\n", 1), ("y\n", 0)])

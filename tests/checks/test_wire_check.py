@@ -195,7 +195,7 @@ def test_a_missing_waiver_names_entry_and_field(tmp_path: Path, line: str, names
     path.write_text(
         f"models:\n  - {{id: mine, backend: api, account: openai, provider_id: openai/gpt-5, {media}, {line}}}\n"
     )
-    with raises(TrapsError, "base.yamlfile.parse_yaml_model", "models.yaml: ", " 1 (mine): ", *names):
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model", "models.yaml:", " 1 (mine): ", *names):
         load_models(path)
 
 

@@ -35,6 +35,23 @@ def test_a_budget_that_is_no_number_is_named(said: str, tmp_path: Path, capsys: 
     assert f"--budget-usd {said}: " in capsys.readouterr().err
 
 
+def test_a_stage_that_is_none_is_refused_and_leaves_no_workspace(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "demo", "--workspace", str(tmp_path / "w"), "--until", "vidos"]) == 1
+    assert "--until vidos: " in capsys.readouterr().err and not (tmp_path / "w").exists()
+
+
+def test_an_empty_variable_names_no_folder_of_the_history(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("DAGSTER_HOME", "")
+    monkeypatch.delenv("TRAPS_WORKSPACE", raising=False)
+    assert main(["init", "demo", "--workspace", str(tmp_path / "w")]) == 0
+    assert str(tmp_path / "w" / "dagster") in capsys.readouterr().out
+    monkeypatch.undo()
+
+
 @pytest.mark.slow
 def test_words_of_any_kind_in_the_place_of_an_experiment_end_in_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

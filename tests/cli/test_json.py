@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 from tests.conftest import EXPERIMENT, Checkout
+from traps_pipeline.cli import main
 from traps_pipeline.cli.command import print_json
 
 ITEM = "occlusion:domino_chain-0001:void"
@@ -43,7 +44,9 @@ def test_what_is_missing_is_null_and_tables_are_lists_of_rows(capsys: pytest.Cap
     }
 
 
-def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
+def test_a_study_is_read_without_its_tables(
+    small: Checkout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     plan = read(small, "plan", EXPERIMENT)
     assert plan["plan"]["calls"]["oracle"][0] == {"wanted": 96, "known": 96}
     why = read(small, "why", ITEM)
@@ -58,7 +61,11 @@ def test_a_study_is_read_without_its_tables(small: Checkout) -> None:
     assert elsewhere["command"] == f"traps run {EXPERIMENT} --workspace {small.workspace}"
     # The study does not say where the file of its experiment lies.
     job = "dagster job execute -m traps_pipeline.definitions -j everything"
-    assert read(small, "status")["command"] == job
+    assert read(small, "status")["command"] == job and status["ledger"] == []
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").touch()  # the current folder may hold it
+    assert main(["status", "--json", "--workspace", str(small.workspace)]) == 0
+    assert json.loads(capsys.readouterr().out)["command"] == f"traps run small.yaml --workspace {small.workspace}"
 
 
 def test_a_site_says_what_it_holds(small: Checkout, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from tests.terminals import Screen, read_all, terminal
-from traps_pipeline.base.progress import HEARTBEAT_S, Progress, Tally
+from traps_pipeline.base.progress import HEARTBEAT_S, Progress, Tally, use_progress
 from traps_pipeline.cli import main
 from traps_pipeline.cli.printed_progress import LiveProgress, make_progress
 
@@ -48,7 +48,7 @@ def test_a_line_has_pace_latency_failures_money_and_time_left(clock: Clock) -> N
     report = Progress()
     ask(report, clock)
     # 40 calls in 40 s, whose median took 2.1 s; all calls of 2 of 4 cells are made, so as long again is left
-    line = "responses: 1 of 4, 1.0/s at 2.1 s, 1 error, 1 retry, $11.00 of $50.00, 0:40 left"
+    line = "responses: 1 of 4 made, 40 of 40 calls, 1.0/s at 2.1 s, 1 error, 1 retry, $11.00 of $50.00, 0:40 left"
     assert report.line() == line
 
 
@@ -60,7 +60,7 @@ def test_the_time_left_of_a_large_cell_is_that_of_the_slices_to_come(clock: Cloc
         for _ in range(10):
             clock.now += 1.0
             report.called("judge", False, latency_s=1.0, dollars=0.0)
-    assert report.line() == "votes: 0 of 1, 1.0/s at 1.0 s, 0:20 left"
+    assert report.line() == "votes: 0 of 1 made, 30 of 30 calls, 1.0/s at 1.0 s, 0:20 left"
 
 
 def test_a_listener_hears_of_a_stage_every_half_minute_and_at_its_end(clock: Clock) -> None:
@@ -115,9 +115,9 @@ def test_no_time_is_said_to_be_left_before_a_stage_has_a_pace(clock: Clock) -> N
     report.stage("votes", 4)
     report.partition("votes", "a", Tally(asked=3))
     clock.now = 4.0  # its judges' libraries are loaded, and little else
-    assert report.line() == "votes: 1 of 4, 0:04 so far"
+    assert report.line() == "votes: 1 of 4 made, 0:04 so far"
     clock.now = 10.0
-    assert report.line() == "votes: 1 of 4, 0:30 left"
+    assert report.line() == "votes: 1 of 4 made, 0:30 left"
 
 
 def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
@@ -132,11 +132,50 @@ def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
     assert (begin["event"], begin["stage"], begin["done"], begin["partitions"]) == ("begin", "responses", 0, 4)
     assert (progress["event"], progress["spent_usd"], progress["budget_usd"]) == ("progress", 11.0, 50.0)
     assert progress["left_s"] == 40.0
-    gpt = {"done": 40, "wanted": 40, "cached": 14, "errors": 1, "retries": 1}
+    gpt = {"done": 40, "wanted": 40, "cached": 14, "errors": 1, "retries": 1, "in_flight": 0, "oldest_s": 0.0}
     assert progress["calls"] == {"gpt": gpt | {"per_second": 1.0, "p50_s": 2.1, "p95_s": 3.9, "usd": 10.0}}
     assert (note["event"], note["text"], result["text"]) == ("note", "slow", "ok   gpt")
     assert (end["event"], end["asked"], end["errors"]) == ("end", 20, 1)
     assert (finish["event"], finish["asked"], finish["spent_usd"]) == ("finish", 20, 11.0) and "stage" not in finish
+
+
+def test_the_calls_of_all_cells_and_those_in_flight_are_told_from_the_first_line(clock: Clock) -> None:
+    out = io.StringIO()
+    report = make_progress("json", out)
+    report.money(0.0, 20.0)
+    report.stage("responses", 8)
+    report.expect("responses", {"gpt": (32, 4), "known": (0, 36)}, 8)
+    with report.in_flight("gpt"), report.in_flight("gpt"):
+        clock.now = 41.0
+        report.called("gpt", False, latency_s=41.0, dollars=0.0)
+        # two in flight, one done of 32 calls in 41 s: as much again 31 times
+        line = "1 of 32 calls, 2 in flight (the oldest 0:41), 0.0/s at 41.0 s, $0.00 of $20.00, 21:11 left"
+        assert report.line() == f"responses: 0 of 8 made, {line}"
+        report.beat()
+    begin, first, later = map(json.loads, out.getvalue().splitlines())
+    assert begin["budget_usd"] == first["budget_usd"] == 20.0
+    assert (first["event"], first["calls"]["gpt"]["wanted"], first["calls"]["gpt"]["done"]) == ("progress", 32, 0)
+    assert (later["calls"]["gpt"]["in_flight"], later["calls"]["gpt"]["oldest_s"]) == (2, 41.0)
+    assert report.figures()["calls"]["gpt"]["in_flight"] == 0
+
+
+def test_a_stopped_run_says_how_many_calls_it_waits_for_and_nothing_of_what_it_would_have_made(clock: Clock) -> None:
+    out = io.StringIO()
+    with pytest.raises(KeyboardInterrupt), use_progress(make_progress("plain", out)) as report:
+        report.stage("metrics", 1)
+        report.partition("metrics", "a", Tally())
+        report.stage("responses", 8)
+        report.expect("responses", {"gpt": (32, 0)}, 8)
+        report.called("gpt", False, latency_s=1.0, dollars=0.25)
+        with report.in_flight("gpt"):
+            clock.now = 8.0
+            report.is_stopping = True
+            report.beat()
+        raise KeyboardInterrupt
+    assert out.getvalue().splitlines()[1:] == [
+        "responses: stopping: waiting for 1 call in flight, the oldest for 0:08",
+        "responses: 0 of 8 made, 1 of 32 calls, $0.25, 0:08",
+    ]
 
 
 def test_a_failure_among_lines_of_json_is_one_of_them(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.exchange import harness_logs
 from traps_pipeline.exchange.answer_exchange import Answer, AnswerContext, _answers_by_item, checked_answers
 from traps_pipeline.exchange.harness_logs import reader_of
 from traps_pipeline.models.request import Request
@@ -102,3 +103,20 @@ def test_a_byte_order_mark_before_the_first_line_is_no_part_of_it(tmp_path: Path
     path.write_text('{"item": "x", "regime": "json", "text": "left"}\n', encoding="utf-8-sig")
     reader = reader_of(path)
     assert reader is not None and _answers_by_item(reader(path), wanted(1), AnswerContext("m"))[0]["x1"].text == "left"
+
+
+def test_samples_that_together_are_larger_than_a_log_may_be_are_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a thousand entries of a small archive share one that unpacks to 256 MB."""
+    log, text = tmp_path / "log.eval", json.dumps(sample())
+    with zipfile.ZipFile(log, "w") as archive:
+        for number in range(3):
+            archive.writestr(f"samples/{number}_epoch_1.json", text)
+    reader = reader_of(log)
+    assert reader is not None
+    monkeypatch.setattr(harness_logs, "MAX_LOG_BYTES", 3 * len(text))
+    assert len([*reader(log)]) == 3
+    monkeypatch.setattr(harness_logs, "MAX_LOG_BYTES", 3 * len(text) - 1)
+    with raises(TrapsError, "exchange.harness_logs._eval_log", str(log)):
+        next(reader(log))

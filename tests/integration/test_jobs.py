@@ -14,7 +14,7 @@ from tests.conftest import ROOT, Checkout
 from traps_pipeline.definitions import defs
 from traps_pipeline.pipeline.graph import JOB_GROUPS, the_graph
 from traps_pipeline.pipeline.run import dagster_history
-from traps_pipeline.pipeline.runs import PARENT_TAG, ROOT_TAG, LocalRuns
+from traps_pipeline.pipeline.runs import JOB_TAG, PARENT_TAG, ROOT_TAG, LocalRuns
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -48,6 +48,7 @@ def test_every_job_succeeds_in_its_turn_from_an_empty_study(empty: Checkout, mon
         *("benchmark", "benchmark", "evaluation", "scoring", "scoring"),
     ]
     assert all(run.tags[ROOT_TAG] == run.tags[PARENT_TAG] for run in started)
+    assert all(run.tags[JOB_TAG] == runs[run.tags[PARENT_TAG]].job_name for run in started)
 
 
 def test_a_job_that_is_stopped_leaves_no_failed_run_behind(empty: Checkout, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import dagster as dg
 import pytest
 
 from tests.conftest import KEY, ROOT, SMALL, Checkout
 from tests.providers.server import Provider
 from tests.providers.servers import closed_port
+from traps_pipeline.pipeline.run import dagster_history
+from traps_pipeline.pipeline.step import EXPERIMENT_TAG
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
@@ -91,7 +94,7 @@ def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_
     study = Checkout(ROOT, tmp_path / "study")
     finished = study.traps("run", path, "--judged-by-rules")
     assert (finished.code, finished.raised) == (1, "checks.live_check.require_sound")
-    *told, advice = (line for line in finished.err.splitlines() if not line.startswith("! "))
+    *told, advice = (line for line in finished.err.splitlines() if not line.startswith(("! ", "preflight: ")))
     for (name, what), line in zip(named.items(), told, strict=True):
         assert f"{name}: " in line and what in line, finished.err
     assert "--no-preflight" in advice
@@ -101,7 +104,7 @@ def test_whatever_is_wrong_with_a_model_is_named_before_anything_is_rendered_or_
 
 @pytest.mark.parametrize("panel", ["rules", "three"])
 def test_a_run_that_made_its_tables_prints_them_whatever_the_votes_are(
-    unasked: Checkout, provider: Provider, panel: str
+    unasked: Checkout, provider: Provider, panel: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prose, endless = {"": "I think that it may fall, or so."}, {"": "The answer is: left." * 55_000}
     provider.configure(scripts={"org/Seer-7B": prose, "dots": endless, "judge-c": {"": "I say no JSON."}})
@@ -113,6 +116,31 @@ def test_a_run_that_made_its_tables_prints_them_whatever_the_votes_are(
         assert "run the same command" not in finished.out + finished.err
         assert finished.code == (0 if panel == "rules" else 1)  # unread answers are counted; broken votes are told
         assert ("few_invalid_votes" in finished.err) == (panel == "three")
+    # the answers of dots have no end, and the rules do not read those of seer, which are prose
+    lacking = (
+        "dots: 12 of 12 answers were unfinished"
+        if panel == "three"
+        else "dots, seer: 12 of 24 answers were unfinished, 12 unread"
+    )
+    assert lacking in finished.out and finished.out.index(lacking) < finished.out.index("Judged by")
+    explorer = json.loads(
+        (unasked.workspace / "reports" / "data" / "study.js").read_text().partition(",")[2].partition(",")[2][:-3]
+    )
+    titles = [column["title"] for column in explorer["counts"]]
+    assert explorer["shortfall"].startswith(lacking)
+    page = (unasked.workspace / "reports" / "report.html").read_text()
+    assert lacking in page and titles and all(f">{title}<" in page for title in titles)
+    monkeypatch.setenv("DAGSTER_HOME", str(unasked.workspace / "dagster"))
+    with dagster_history(Workspace.open(unasked.workspace)) as instance:
+        runs = instance.get_runs()
+        events = [
+            entry for run in runs for entry in instance.all_logs(run.run_id, dg.DagsterEventType.ASSET_CHECK_EVALUATION)
+        ]
+    own = [run for run in runs if run.tags.get(EXPERIMENT_TAG) == "own"]
+    checks = [entry.get_dagster_event().asset_check_evaluation_data for entry in events]
+    failed = {(check.check_name, check.severity) for check in checks if not check.passed}
+    assert own and {run.status for run in own} == {dg.DagsterRunStatus.SUCCESS}  # what blocks nothing turns no step red
+    assert failed == ({("few_invalid_votes", dg.AssetCheckSeverity.WARN)} if panel == "three" else set())
     rows = board(unasked)
     assert rows["seer"]["n_unread"] == (12 if panel == "rules" else 0)
     assert rows["dots"]["n_unfinished"] == rows["dots"]["n_missing"] == 12  # 1.1 MB in 8,000 tokens

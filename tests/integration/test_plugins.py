@@ -40,6 +40,26 @@ def nodding(entry):
 
 def broken(entry):
     raise OSError("no such bird")
+
+
+class Odd:
+    def __init__(self, answer):
+        self.answer = answer
+
+    async def ask(self, request):
+        return self.answer()
+
+
+def mute(entry):
+    return Odd(lambda: None)
+
+
+def failing(entry):
+    return Odd(lambda: entry.wings)
+
+
+def negative(entry):
+    return Odd(lambda: Outcome("answer", text="yes", cost_usd=-1000.0))
 """
 EXPERIMENT = """
 name: birds
@@ -101,9 +121,13 @@ def test_a_model_and_a_judge_from_a_package_are_asked_and_their_rows_name_its_ve
         ('parrot = "nowhere:parrot"', "nowhere"),
         ('parrot = "birds:broken"', "no such bird"),
         ('parrot = "birds:Parrot.ask"', "birds 1.2"),
+        ('parrot = "birds:mute"', "None"),
+        ('parrot = "birds:failing"', "wings"),
+        ('parrot = "birds:negative"', "cost_usd"),
+        ('parrot = "birds:parrot"\nreference = "birds:parrot"', "reference"),
     ],
 )
-def test_a_package_that_makes_no_backend_is_named_with_the_way_out(
+def test_a_package_whose_backend_fails_is_named_with_the_way_out(
     packaged: Checkout, tmp_path: Path, point: str, named: str
 ) -> None:
     install(write_package(tmp_path / "birds", "birds", PARROT, models=point), packaged.root)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import pytest
@@ -25,6 +26,8 @@ def test_calls_are_shown_below_all_else_while_they_are_made(unasked: Checkout, p
     bottoms = [[line for line in frame if line][-3:] for frame in screen.frames if len(frame) > 2]
     live = [bottom for bottom in bottoms if bottom[0].startswith("responses ") and "p95" in bottom[1]]
     assert len(live) > 3  # it is drawn again and again
+    assert all(f"/{ITEMS}" in bottom[2] for bottom in live)  # of the stage, and not of the cells that were begun
+    assert any(re.search(r" \d+, \d+ s ", bottom[2]) for bottom in live)  # in flight, and the age of the oldest
     heading, _, row = live[-1]
     assert " of $20.00" in heading and " left" in heading
     assert row.startswith("image-model") and f"/{ITEMS}" in row

@@ -190,7 +190,7 @@ def test_labels_are_read_or_invalid_for_a_reason() -> None:  # as votes are: tes
     axes = dict(zip(AXES, (True, False, True, False), strict=True))
     assert parse_judgement(Labels, {"outcome": "answer", "text": right}) == Labels(**axes, rationale="because")
     for text, reason in (
-        ('{"hallucinated_premise": true}', "invalid_inference: Field required"),
+        ('{"hallucinated_premise": true}', "invalid_inference: is missing"),
         (right.replace("true", '"yes"', 1), "hallucinated_premise: "),
     ):
         found = parse_judgement(Labels, {"outcome": "answer", "text": text})

@@ -160,8 +160,8 @@ def test_a_number_that_is_none_makes_a_vote_invalid_and_not_wrong(value: str) ->
         ("", "answer", "Invalid JSON"),
         ("It abstained.", "answer", "Invalid JSON"),
         ('{"abstained": true', "truncated", "Invalid JSON"),
-        ("[]", "answer", "should be an object"),
-        ('{"abstained": true, "confidence": "high"}', "answer", "reasoning: Field required"),
+        ("[]", "answer", "must be a mapping"),
+        ('{"abstained": true, "confidence": "high"}', "answer", "reasoning: is missing"),
         ('{"abstained": "yes", "confidence": "high", "reasoning": ""}', "answer", "abstained: "),
         ('{"abstained": false, "abstained": true, "confidence": "high", "reasoning": ""}', "answer", ""),  # a key twice
         ("unread", "answer", "unread"),  # of a rule judge

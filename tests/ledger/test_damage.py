@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -310,6 +311,21 @@ def test_what_is_whole_of_a_cut_ledger_is_saved_and_the_rest_is_told(tmp_path: P
     assert all(saved.read("m").rows[key] == rows[int(key[1:])] for key in saved.read("m").rows)
     assert f"{200 - count} rows" in told[0] and all(str(file) in words for words in told)
     assert saved.totals()["m"].dollars == 50.0  # those that were lost were paid, too
+
+
+def test_plan_and_status_tell_what_the_seal_finds_before_a_run_refuses_it(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path / "study", Study(panel="rules"))
+    write(workspace.answers, paid("a", 0.5))
+    checkout = Checkout(ROOT, workspace.root)
+    commands = (("status",), ("plan", "demo"))
+    for command in commands:
+        assert json.loads(checkout.traps(*command, "--json").ok().out)["ledger"] == []
+    file = workspace.root / "ledger" / "ledger.sqlite"
+    with sqlite3.connect(file) as connection:
+        connection.executescript(CHANGES["a total lowered"].replace("'m'", "participant"))
+    for command in commands:
+        (fault,) = json.loads(checkout.traps(*command, "--json").ok().out)["ledger"]
+        assert str(file.parent) in fault and fault in checkout.traps(*command).ok().out
 
 
 def test_rows_that_tables_have_and_the_ledger_lacks_are_told(tmp_path: Path) -> None:

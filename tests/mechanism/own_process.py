@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -17,13 +16,9 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.mechanism.study import register
-from traps_pipeline.mechanism import patching_stage, stages
-from traps_pipeline.mechanism.mechanism_rows import STEERING
+from traps_pipeline.mechanism import patching_stage
 from traps_pipeline.mechanism.patching_effects import RecordedPass, record
-from traps_pipeline.mechanism.steered_backend import SteeredBackend
-from traps_pipeline.mechanism.steering import collect_steered
 from traps_pipeline.models.registry.entries import ModelEntry
-from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.cells import Extraction, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
 
@@ -40,18 +35,6 @@ def start(work: Literal["steer", "patch"], workspace: Path, entry: ModelEntry) -
 def printed(process: subprocess.Popen[str]) -> dict[str, Any]:
     """Wait for what a process prints in the end."""
     return json.loads(process.communicate()[0].splitlines()[-1])
-
-
-def steer(workspace: Workspace, entry: ModelEntry, patch: pytest.MonkeyPatch) -> dict[str, Any]:
-    generated, generate = list[Outcome](), SteeredBackend.generate
-
-    def counting(of: SteeredBackend, wanted: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
-        generated.extend(made := generate(of, wanted, stopped))
-        return made
-
-    patch.setattr(SteeredBackend, "generate", counting)
-    ((_, cell),) = collect_steered(workspace, entry, [CELL], {"standard": stages.saved_directions(workspace, STANDARD)})
-    return {"made": len(generated), "content": {row.request_key: row.text for row in cell.rows(STEERING)}}
 
 
 def patch_pairs(workspace: Workspace, entry: ModelEntry, patch: pytest.MonkeyPatch) -> dict[str, Any]:
@@ -71,7 +54,7 @@ def main(work: str, workspace: str, described: str) -> None:
     entry = ModelEntry.model_validate_json(described)
     with pytest.MonkeyPatch.context() as patch:
         register(patch, entry)
-        found = {"steer": steer, "patch": patch_pairs}[work](Workspace.open(Path(workspace)), entry, patch)
+        found = patch_pairs(Workspace.open(Path(workspace)), entry, patch)
     print(json.dumps(found), flush=True)
 
 

@@ -48,13 +48,13 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return lambda clip: folder / clip
 
 
-def test_a_cut_gives_itself_away_by_length_and_stamps_and_swapped_stamps_alone_turn_round(
+def test_a_cut_gives_itself_away_by_length_and_stamps(
     clips: Callable[[str], Path],
 ) -> None:
     frame = items()
     frame = frame.loc[frame["dataset"].str.startswith("chaotic")].reset_index(drop=True)
     cut = (frame["dataset"] == "chaotic") & (frame["side"] == "void")
-    frame = frame.assign(clip=np.where(cut, "void", "control"), times_clip=None)
+    frame = frame.assign(clip=np.where(cut, "void", "control"))
     by_dataset = dict(iter(frame.groupby("dataset", sort=False)))
     made = raw_features(by_dataset, MediaSpec(profile="frames", uniform=2), clips)
     own, run = {}, run_of(frame)
@@ -68,12 +68,6 @@ def test_a_cut_gives_itself_away_by_length_and_stamps_and_swapped_stamps_alone_t
     assert own["all frames"]["chaotic"] == 1.0  # the last frame of the whole clip is brighter
     assert own["question words"]["chaotic_ill_posed"] == 1.0 and own["length"]["chaotic_ill_posed"] == 0.5
     assert made["length"]["chaotic"][:2].ravel().tolist() == [2.75, 1.75]  # the last of 12 and of 8 frames, 4 a second
-    swapped = by_dataset["chaotic"].assign(
-        times_clip=np.where(by_dataset["chaotic"]["side"] == "void", "control", "void")
-    )
-    turned = raw_features({"chaotic": swapped}, MediaSpec(profile="frames", uniform=2), clips)
-    assert (turned["time stamps"]["chaotic"][0] == made["time stamps"]["chaotic"][1]).all()
-    assert (turned["length"]["chaotic"] == made["length"]["chaotic"]).all()
 
 
 def test_noise_shows_what_shared_controls_give_and_that_held_out_scenarios_take_it_away() -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from traps_pipeline.cli import main
-from traps_pipeline.mechanism.cost import CARDS, Card, Work, cost_of, mechanism_passes
+from traps_pipeline.mechanism.cost import CARDS, RANDOM, Card, Cost, Work, cost_of, mechanism_passes, too_large
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import MechanismSettings
 
-CARD = Card(operations=1e15, bandwidth=1e12)
+CARD = Card(operations=1e15, bandwidth=1e12, gigabytes=80)
 CACHED_GB = 2 * 2**30 / 1e9  # features of clips
 
 
@@ -29,18 +29,18 @@ def test_the_passes_of_the_papers_study_are_counted() -> None:
         {
             "models": {"m": {"steering": 1, "centroid": 1}},
             "patching": {"pairs": 50, "exact": 24},
-            "gate": {"untrained": True},
         }
     )
     scenarios = {"occlusion": 202, "chaotic": 500}
     passes = {work.kind: work.passes for work in mechanism_passes(settings, DATASETS, scenarios)}
-    assert passes["states"] == 2 * (4 * 202 + 4 * 500) + 202 + 2 * 500
+    assert passes["states"] == 2 * (4 * 202 + 4 * 500) + 202
     assert passes["sentences"] == 2 * (4 * 202 + 4 * 500)  # one pass an item under each of two regimes
-    assert passes["states of random weights"] == 4 * 202 + 4 * 500 + 202 + 2 * 500
+    assert passes["states of random weights"] == 2 * (4 * 202 + 4 * 500 + 202)
+    assert RANDOM not in {w.kind for w in mechanism_passes(settings, DATASETS, scenarios, random_weights=False)}
     # Two directions of 100 pairs: 2 records and a gradient (3); 1 + 4 records; 4 sources x (24 + 1) rows of half a pass
     assert passes["patching"] == 2 * 100 * (5 + 5 + 50)
     few = mechanism_passes(settings, ["chaotic"], {"chaotic": 3, "occlusion": 202})[0]
-    assert few.passes == 2 * (2 * 3) + 2 * 3
+    assert few.passes == 2 * (2 * 3)
 
 
 def test_hours_and_gigabytes_follow_from_parameters_tokens_and_the_card() -> None:
@@ -65,6 +65,18 @@ def test_frames_are_those_that_a_clip_of_five_seconds_has() -> None:
 def test_without_a_size_tokens_are_known_and_hours_are_not() -> None:
     cost = cost_of(entry(size=None), MediaSpec(profile="frames", uniform=10), Work("states", 5), CARD, quantised=False)
     assert (cost.tokens_in, cost.hours, cost.gigabytes) == (5000, None, None)
+
+
+def test_what_does_not_fit_a_card_is_told_with_what_would_help() -> None:
+    def cost(model: str, kind: str, gigabytes: float | None) -> Cost:
+        return Cost(model, kind, 1, 0.0, 0.0, 1.0, gigabytes)
+
+    costs = [cost("a", "patching", 27.3), cost("a", "states", 23.9), cost("b", RANDOM, 30.0), cost("c", "states", None)]
+    (patching, random) = too_large([*costs, cost("b", "states", 24.0)], CARDS["RTX4090"], {"a"})
+    assert "27.3 GB" in patching and "24" in patching and "patching: null" in patching and "nf4" not in patching
+    assert random.startswith("b, states of random weights") and "random_weights: false" in random
+    (bf16,) = too_large([cost("b", "states", 25.0)], CARDS["RTX4090"], {"a"})
+    assert "nf4" in bf16
 
 
 def test_a_card_that_is_not_known_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,6 @@ from traps_pipeline.mechanism.gate import (
     Items,
     Outcomes,
     decide,
-    risk_coverage,
     thresholds,
 )
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
@@ -59,15 +58,6 @@ def test_the_interval_of_a_gate_has_a_width_where_all_items_agree(right: float) 
     low, high = interval(figures[:, gating._PECS, 1:], right, (0.0, 1.0))
     outermost = 0.025 ** (1 / n)  # Clopper and Pearson's lower end of n of n; .74 for 12
     assert low <= outermost + 0.02 and high == 1.0 if right else low == 0.0 < high
-
-
-def test_risk_falls_as_the_riskiest_answers_are_given_up() -> None:
-    outcomes = Outcomes(
-        np.array([False, False, True, True]), np.array([1, 0, np.nan, np.nan]), np.array([0, 0, 0, 1.0])
-    )
-    score = np.array([-2.0, -1.0, 3.0, 9.0])  # the last item is answered by nobody: the model abstained itself
-    points = risk_coverage(score, outcomes, [0.25, 0.5, 0.75, 1.0])
-    assert points == [(0.25, 0.0, 1), (0.5, 0.5, 2), (0.75, pytest.approx(2 / 3), 3)]
 
 
 def study(pairs: int = 12, families: int = 3) -> tuple[Items, np.ndarray]:

@@ -22,14 +22,12 @@ from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
 from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, record
-from traps_pipeline.mechanism.shared_answers import SharedAnswers
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.request import Request
 from traps_pipeline.storage.media import Frames, MediaSpec, sample
-from traps_pipeline.storage.store import FolderStore
 from traps_pipeline.video.encode import encode
 
 pytestmark = pytest.mark.slow
@@ -151,7 +149,7 @@ def other_clip() -> Path:
 
 
 @each
-def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: str, tmp_path: Path) -> None:
+def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: str) -> None:
     """Batched and with clips seen once, against neither of these."""
     of, layer = subject(name), 2
     rng = np.random.default_rng(1)
@@ -171,7 +169,7 @@ def test_a_sheet_of_steered_answers_is_what_a_plain_hook_gives_row_by_row(name: 
         )
         for number, steering in rows
     ]  # fmt: skip
-    backend = SteeredBackend(of.entry, vectors, SharedAnswers(FolderStore(tmp_path), tmp_path, len(requests)))
+    backend = SteeredBackend(of.entry, vectors)
     before = of.of.clips.passes
     found = [outcome.text or "" for outcome in backend.generate(requests, lambda: False)]
     assert of.of.clips.passes - before <= 2  # clips, of classes whose features come clip by clip

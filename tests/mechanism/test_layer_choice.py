@@ -11,7 +11,6 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS
-from traps_pipeline.report.tables.probe_tables import layer_curves
 from traps_pipeline.storage.study import ProbeSettings
 
 LAYERS, PEAK, PAIRS = 6, 4, 10
@@ -48,19 +47,6 @@ def test_a_layer_is_chosen_where_probes_carry_over_although_all_layers_separate_
     assert transfer[transfer["chosen"]]["layer"].tolist() == [PEAK] * 12
     assert transfer[transfer["chosen"]]["value"].min() > 0.95
     assert transfer[transfer["layer"] == 1]["value"].mean() < 0.7  # where the maximum within a dataset is first reached
-
-
-@pytest.mark.slow
-@pytest.mark.promise
-def test_the_curve_and_its_ties_are_printed(saturated: pd.DataFrame) -> None:
-    table, notes = layer_curves(saturated)
-    assert table["layer"].tolist() == [*range(LAYERS)] and table["n_at_top"].tolist() == [0, 4, 4, 4, 4, 4]
-    at = table.set_index("layer")
-    for dataset in DATASETS:
-        assert at[f"{dataset}_mark"].to_dict() == {layer: "*" if layer == PEAK else "" for layer in range(LAYERS)}
-        assert at[dataset].idxmax() == PEAK
-    (ties,) = notes
-    assert ties.startswith("m:") and ties.endswith("oc 1, oc_ip 1, ch 1, ch_ip 1")
 
 
 def row(analysis: str, source: str, target: str, *values: float) -> list[dict[str, object]]:

@@ -16,30 +16,34 @@ import torch
 
 from tests.build.errors import raises
 from tests.build.mechanism import STANDARD, entry, extract_all, patch
-from tests.mechanism.study import CATEGORY, PAIRS, SETTINGS, filled, make_study
+from tests.mechanism.study import CATEGORY, PAIRS, filled, make_study, register
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
-from traps_pipeline.mechanism.baselines import output_margins
-from traps_pipeline.mechanism.control_rows import GateRow
+from traps_pipeline.mechanism.baselines import MARGIN, output_features
+from traps_pipeline.mechanism.control_rows import MODEL, RESIDUAL, STATES, GateRow
 from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS, decide
-from traps_pipeline.mechanism.gating import UNTRAINED, gate_items, gate_rows, gate_table, read_states
+from traps_pipeline.mechanism.gating import gate_items, gate_rows, gate_table, read_states
 from traps_pipeline.mechanism.item_scores import item_score_rows
+from traps_pipeline.mechanism.leads import lead_rows, nuisance_components, placed, residual
 from traps_pipeline.mechanism.lens import lens_rows
 from traps_pipeline.mechanism.margin import is_abstention_start
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
+from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.sentences import mean_log_probabilities, sentence_rows
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
-from traps_pipeline.mechanism.untrained import untrained_states
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.local.adapter import load_local_model
+from traps_pipeline.models.local.capture import first_tensor
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.local_settings import MechanismSpec
 from traps_pipeline.models.registry.prompts import system_prompt, vqa_prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import sample
 from traps_pipeline.storage.study import ProbeSettings
@@ -49,12 +53,12 @@ pytestmark = pytest.mark.slow
 __all__ = ["entry", "patch"]  # fixtures
 ARMS = ("length_matched",)
 EVERY = (*DATASETS, *ARMS)
+RANDOM = [Extraction("tiny", name) for name in RANDOM_WEIGHTS]
 
 
 @pytest.fixture(scope="module")
 def study(entry: ModelEntry, patch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Extracted, probed and judged; a control's clip stands for the short one."""
-    patch.setattr("tests.mechanism.study.SETTINGS", SETTINGS | {"gate": {"untrained": True}})
+    """Extracted, probed and judged; a void's clip stands for both panels, a control's for the short clip."""
     workspace = make_study(tmp_path_factory.mktemp("study"))
     for arm, shown in zip(ARMS, ("control",), strict=True):
         rows = []
@@ -66,7 +70,9 @@ def study(entry: ModelEntry, patch: pytest.MonkeyPatch, tmp_path_factory: pytest
                 made |= {"question": f"Where does {row['scenario_id']} end?", "ground_truth": "left"}
                 rows.append(ITEMS.row_type(**made))
         workspace.tables.write(ITEMS, {"dataset": arm}, rows, {})
-    extract_all(workspace, EVERY)
+    for extraction in (STANDARD, *RANDOM):
+        extract_all(workspace, EVERY, extraction)
+        workspace.tables.write(PROBES, extraction.partition, stages.probe_rows(workspace, extraction), {})
     for dataset in EVERY:
         partition = {"dataset": dataset, "model": "tiny", "regime": "standard", "run": 1}
         items = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
@@ -145,42 +151,93 @@ def test_a_gate_reports_how_many_look_alikes_it_abstains_on(gates: list[GateRow]
 # --- a network that has learnt nothing --------------------------------------------------------------------------------
 
 
-def test_the_gate_of_an_untrained_network_is_a_row_beside_the_trained_ones_where_it_is_asked_for(
-    study: Workspace, entry: ModelEntry, gates: list[GateRow]
-) -> None:
-    rows = [row for row in gates if row.features == UNTRAINED]
-    assert {(row.source, row.layer, row.regime) for row in rows} == {(OTHER_DATASETS, -1, "standard")}
-    assert {(row.target, row.threshold) for row in rows} == {(t, h) for t in (*EVERY, "all") for h in THRESHOLDS}
-    assert all(row.pecs is not None and row.auroc is not None for row in rows if row.target in DATASETS)
-    settings = study.mechanism
-    gate = settings.gate.model_copy(update={"untrained": False})
-    without = study.allow(mechanism=settings.model_copy(update={"gate": gate}))
-    assert UNTRAINED not in {row.features for row in gate_rows(without, entry, StoredStates.of(without, STANDARD))}
-
-
-def test_untrained_states_are_those_of_random_weights_the_same_at_every_call(
+def test_states_of_random_weights_are_those_of_a_fresh_network_of_the_class_and_differ_by_seed(
     study: Workspace, entry: ModelEntry
 ) -> None:
-    states = StoredStates.of(study, STANDARD)
-    items = {"chaotic": study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"})}
-    stream = torch.get_rng_state()
-    found = untrained_states(study, entry, states, items)["chaotic"]
-    again = untrained_states(study, entry, states, items)["chaotic"]
-    assert np.array_equal(found, again) and torch.equal(stream, torch.get_rng_state())
-    trained = load_local_model(entry, inside=True)
-    layer = (trained.n_layers + 1) // 2
-    assert found.shape == states.read("chaotic", layer).shape
-    assert np.abs(found - states.read("chaotic", layer)).max(axis=1).min() > 1e-2  # of every item
-    other = study.allow(mechanism=study.mechanism.model_copy(update={"seed": study.mechanism.seed + 1}))
-    assert np.abs(untrained_states(other, entry, states, items)["chaotic"] - found).max() > 1e-2
-    with torch.random.fork_rng(devices=[]):  # once more, in plain transformers
-        torch.manual_seed(study.mechanism.seed)
-        network = load_transformers().AutoModelForImageTextToText.from_config(trained.network.config).eval()
-    for row, expected in zip(items["chaotic"].to_dict("records"), found, strict=True):
-        prompt = own_prompt(study, entry, {str(name): value for name, value in row.items()}, vqa_prompt("standard"))
-        with torch.no_grad():
-            out = network(**prompt, output_hidden_states=True)
-        assert np.array_equal(out.hidden_states[layer][0, -1].numpy(), expected)
+    stream, trained = torch.get_rng_state(), load_local_model(entry, inside=True)
+    states = [StoredStates.of(study, extraction) for extraction in (STANDARD, *RANDOM)]
+    read = [of.read("chaotic", trained.n_layers) for of in states]
+    for one, other in ((0, 2), (1, 2)):  # the tiny checkpoint is itself a fresh network, of seed 0
+        assert np.abs(read[one] - read[other]).max(axis=1).min() > 1e-2  # of every item
+    assert len({of.items["checkpoint_digest"].iloc[0] for of in states}) == 3
+    items = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).to_dict("records")
+    for seed, found in enumerate(read[1:]):
+        with torch.random.fork_rng(devices=[]):  # once more, in plain transformers
+            torch.manual_seed(seed)
+            network = load_transformers().AutoModelForImageTextToText.from_config(trained.network.config).eval()
+        captured = list[torch.Tensor]()
+        network.get_decoder().layers[-1].register_forward_hook(lambda _, __, out, to=captured: to.append(out))
+        for row, expected in zip(items, found, strict=True):
+            prompt = own_prompt(study, entry, {str(k): v for k, v in row.items()}, vqa_prompt("standard"))
+            with torch.no_grad():
+                network(**prompt)
+            assert np.array_equal(first_tensor(captured[-1])[0, -1].numpy(), expected)
+    assert torch.equal(stream, torch.get_rng_state())
+
+
+def test_gates_of_random_weights_stand_beside_the_trained_ones_but_where_the_entry_says_not(
+    study: Workspace, entry: ModelEntry, gates: list[GateRow]
+) -> None:
+    rows = [row for row in gates if row.features in RANDOM_WEIGHTS]
+    assert {(row.features, row.source, row.regime) for row in rows} == {
+        (name, OTHER_DATASETS, "standard") for name in RANDOM_WEIGHTS
+    }
+    assert all(row.pecs is not None and row.auroc is not None for row in rows if row.target in DATASETS)
+    without = entry.model_copy(update={"mechanism": MechanismSpec(random_weights=False)})
+    with pytest.MonkeyPatch.context() as patch:
+        register(patch, without)
+        states = StoredStates.of(study, STANDARD)
+        assert not {*RANDOM_WEIGHTS} & {row.features for row in gate_rows(study, without, states)}
+        assert {row.subject for row in lead_rows(study, without, states)} == {MODEL, *ARMS}
+
+
+# --- states among their rivals ----------------------------------------------------------------------------------------
+
+
+def test_every_subject_has_states_and_rivals_by_probes_that_saw_neither_dataset_nor_scenario(
+    study: Workspace, entry: ModelEntry
+) -> None:
+    rows = pd.DataFrame(lead_rows(study, entry, StoredStates.of(study, STANDARD)))
+    subjects = {
+        (MODEL, *DATASETS),
+        *((name, *DATASETS) for name in RANDOM_WEIGHTS),
+        *((a, LOOK_ALIKES[a]) for a in ARMS),
+    }
+    assert {(str(s), *part["target"].unique()) for s, part in rows.groupby("subject", sort=False)} == subjects
+    states = rows.loc[rows["features"] == STATES]
+    best = rows.loc[~rows["features"].isin([STATES, RESIDUAL])].groupby(["subject", "target"])["auroc"].max()
+    leads = states.set_index(["subject", "target"])
+    assert np.allclose(leads["auroc"] - best.reindex(leads.index), leads["lead"])
+    assert (leads["lead_low"] <= leads["lead_high"]).all() and rows["auroc"].between(0, 1).all()
+    (own,) = states.loc[(states["subject"] == MODEL) & (states["target"] == "chaotic")].to_dict("records")
+    table, layer = gate_table(StoredStates.of(study, STANDARD)), int(own["layer"])
+    features = read_states(StoredStates.of(study, STANDARD), EVERY, layer)
+    items, folds = gate_items(table, features, shuffled=False, seed=0), study.mechanism.probes.folds
+    decisions = decide(items, OTHER_DATASETS, "chaotic", folds=folds, seed=study.mechanism.seed, false_abs=0.05)
+    void = table.loc[table["dataset"] == "chaotic", "void"].to_numpy(bool)
+    assert own["auroc"] == pytest.approx(float(auroc(void, decisions.score)))
+
+
+def test_a_placebo_takes_the_place_of_a_datasets_voids_and_of_nothing_else() -> None:
+    rows = [("occlusion", True, "a"), ("occlusion", False, "b"), ("chaotic", True, "c"), ("removed", False, "d")]
+    table = pd.DataFrame(rows, columns=["dataset", "void", "item_id"])
+    mask, placed_table = placed(table, "occlusion", "removed")
+    assert mask.tolist() == [False, True, True, True]
+    assert placed_table.to_records(index=False).tolist() == [
+        ("occlusion", False, "b"), ("chaotic", True, "c"), ("occlusion", True, "d"),
+    ]  # fmt: skip
+    mask, same = placed(table, "occlusion", None)
+    assert mask.tolist() == [True, True, True, False] and same["item_id"].tolist() == ["a", "b", "c"]
+
+
+def test_residual_states_hold_nothing_linear_in_the_nuisances() -> None:
+    rng = np.random.default_rng(0)
+    length, noise = rng.normal(size=(80, 1)), rng.normal(size=(80, 3))
+    states = np.hstack([5 * length + 2, noise, length - noise[:, :1]])
+    components = nuisance_components([length, np.zeros((80, 2))])
+    left = residual(states, components)
+    assert components.shape == (80, 1) and np.abs(left[:, 0]).max() < 1e-9
+    assert np.abs(length[:, 0] @ left).max() < 1e-9 and np.abs(left.mean(axis=0)).max() < 1e-9
 
 
 def own_prompt(workspace: Workspace, entry: ModelEntry, row: dict, system: str) -> dict[str, torch.Tensor]:
@@ -227,7 +284,7 @@ def test_every_item_has_a_score_of_states_a_margin_and_its_verdict(study: Worksp
     assert (rows.set_index("item_id")["abstained_standard"] == verdicts.loc[rows["item_id"]]).all()
     assert rows["abstained_guided"].isna().all()  # not asked
     for dataset, of in rows.groupby("dataset"):
-        margins = output_margins(entry, states, [str(dataset)])[str(dataset)][:, 0]
+        margins = output_features(entry, states, states, [str(dataset)])[MARGIN][str(dataset)][:, 0]
         assert of["margin"].to_numpy(float) == pytest.approx(margins)
         (layer,) = {*of["layer"]}
         table, features = gate_table(states), read_states(states, EVERY, layer)
@@ -243,7 +300,7 @@ def test_the_lens_is_the_models_norm_and_head_on_each_layer_and_ends_at_the_outp
     rows = pd.DataFrame(lens_rows(study, entry, states)).set_index(["dataset", "layer"])
     assert len(rows) == len(DATASETS) * states.n_layers
     void = (states.dataset("chaotic")["side"] == "void").to_numpy()
-    margins = output_margins(entry, states, ["chaotic"])["chaotic"][:, 0]
+    margins = output_features(entry, states, states, ["chaotic"])[MARGIN]["chaotic"][:, 0]
     last = rows.loc[("chaotic", model.n_layers)]
     assert (last["voids"], last["controls"]) == pytest.approx((margins[void].mean(), margins[~void].mean()), abs=1e-4)
     with torch.no_grad():

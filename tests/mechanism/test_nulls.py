@@ -18,6 +18,7 @@ from traps_pipeline.storage.study import MechanismSettings
 def effect(kind: str, side: str, dose: float, abstained: int, draw: int = 0, signs: str = "label") -> dict[str, Any]:
     about = {"model": "m", "directions": "standard", "regime": "guided", "source": "chaotic", "target": "chaotic"}
     counts = {"n": 10, "n_missing": 0, "abstained": abstained, "abstention": abstained / 10, "degenerate": 0}
+    counts |= {"undecided": 0.0, "perplexity": None}
     right = {"correct": 10 - abstained, "n_correct": 10} if side == "control" else {"correct": 0, "n_correct": 0}
     dosed = {"unit": "gap", "dose": dose, "signs": signs, "draw": draw, "layer": 3, "kind": kind, "side": side}
     return about | dosed | counts | right | {"epoch": "e"}
@@ -32,6 +33,17 @@ def test_an_effect_is_ranked_among_the_draws_and_ties_count_against_it() -> None
     assert (row.effect, row.null_lowest, row.null_highest) == pytest.approx((0.5, 0.0, 0.5))
     assert row.null_mean == pytest.approx(0.2) and (row.n_at_least, row.draws) == (1, 4)
     assert row.p == pytest.approx(2 / 5) and whole.p == row.p
+
+
+def test_a_draw_whose_answers_say_nothing_counts_as_one_that_moves_nothing() -> None:
+    """Of ten answers along a draw none is decided: it lies below the direction, and is one of the two draws."""
+    rows = [effect("void", "control", 0, 1), effect("void", "control", 1, 6)]
+    for draw in range(2):
+        rows += [effect("isotropic", "control", 0, 1, draw), effect("isotropic", "control", 1, 0, draw)]
+    rows[-1] |= {"n": 0, "n_missing": 10, "undecided": 1.0, "perplexity": 40.0}
+    (row, _) = null_rows(pd.DataFrame(rows))
+    assert (row.draws, row.n_at_least, row.p) == (2, 0, pytest.approx(1 / 3))
+    assert (row.undecided, row.null_undecided, row.null_perplexity) == (0.0, 0.5, 40.0)
 
 
 def test_on_voids_an_effect_is_a_fall_of_abstention() -> None:
@@ -62,6 +74,10 @@ def test_pecs_of_a_steered_model_depends_on_the_sign_policy() -> None:
         ("\u7403\u5728\u5de6\u8fb9", "answer", "script"),
         (None, "empty", "empty"),
         ("42", "answer", None),
+        (".", "answer", "letters"),
+        ("?!", "answer", "letters"),
+        ("lalalalalala", "answer", "repetition"),
+        ("an annotation", "answer", None),
     ],
 )
 def test_a_text_that_is_no_answer_is_told(text: str | None, outcome: str, why: str | None) -> None:
@@ -69,16 +85,16 @@ def test_a_text_that_is_no_answer_is_told(text: str | None, outcome: str, why: s
 
 
 @pytest.mark.parametrize(
-    ("gap", "doses", "null"),
+    ("gap", "doses"),
     [
-        (1.0, [("alpha", 3), ("gap", 0.5), ("gap", 1), ("gap", 2), ("gap", 4)], ("gap", 4)),
-        (4.0, [("alpha", 3), ("gap", 0.5), ("gap", 1), ("gap", 2), ("gap", 4)], ("gap", 4)),  # 16 is twice the states
-        (5.0, [("alpha", 3), ("gap", 0.5), ("gap", 1), ("gap", 2)], ("gap", 2)),
-        (99.0, [("alpha", 3)], ("alpha", 3)),
+        (1.0, [("alpha", 3), ("gap", 0.5), ("gap", 1), ("gap", 2), ("gap", 4)]),
+        (4.0, [("alpha", 3), ("gap", 0.5), ("gap", 1), ("gap", 2), ("gap", 4)]),  # 16 is twice the states
+        (5.0, [("alpha", 3), ("gap", 0.5), ("gap", 1), ("gap", 2)]),
+        (99.0, [("alpha", 3)]),
     ],
 )
-def test_doses_in_gaps_end_at_the_cap_and_nulls_have_the_largest(
-    gap: float, doses: list[tuple[str, float]], null: tuple[str, float]
+def test_doses_in_gaps_end_at_the_cap_and_nulls_have_alphas_and_the_largest(
+    gap: float, doses: list[tuple[str, float]]
 ) -> None:
     unit = np.eye(4, dtype=np.float32)[None, [0, 0, 0]]
     of = Directions({"void": unit, "isotropic": unit}, np.full(3, gap), np.full(3, 8.0))
@@ -86,5 +102,5 @@ def test_doses_in_gaps_end_at_the_cap_and_nulls_have_the_largest(
     settings = MechanismSettings.model_validate({"models": {"m": {"steering": 2, "centroid": 1}}, "steering": steering})
     given = strengths("chaotic", settings.models["m"], settings, {"chaotic": of})
     steered = {kind: [(s.unit, s.dose) for s, _ in given if s.kind == kind] for kind in ("void", "isotropic")}
-    assert steered == {"void": doses, "isotropic": [null]}
+    assert steered == {"void": doses, "isotropic": [("alpha", 3), *doses[1:][-1:]]}
     assert all(s.alpha == pytest.approx(s.dose * gap) for s, _ in given if s.unit == "gap")

@@ -30,7 +30,7 @@ from traps_pipeline.mechanism.probes import (
 )
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
 from traps_pipeline.mechanism.transfer_paths import STEERING_PATHS, TRANSFER_PAIRS
-from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, LONG, TIME_SWAPPED, transfer_type
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, LONG, transfer_type
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.scoring.published import published
 from traps_pipeline.storage.study import ProbeSettings
@@ -289,23 +289,6 @@ def test_shared_controls_flatter_pairs_of_one_taxonomy_unless_their_scenario_is_
     assert abs(value["held_out"].mean() - 0.5) < 0.15  # four pairs of 30 items
     across = [pair for pair in TRANSFER_PAIRS if pair not in pairs]
     assert abs(value["transfer"][across].mean() - 0.5) < 0.15
-
-
-def test_swapped_times_tell_a_probe_of_stamps_from_one_of_frames() -> None:
-    """Column 0 is written by the frames, column 1 by the stamps; swapping the stamps alone turns column 1 around."""
-    items, states = study(pairs=10)
-    chaotic = items.loc[items["dataset"] == "chaotic"]
-    items = pd.concat([items, chaotic.assign(dataset=TIME_SWAPPED)], ignore_index=True)
-    void, rng = (chaotic["side"] == "void").to_numpy(), np.random.default_rng(1)
-    for layer, column in ((0, 0), (1, 1)):  # layer 0 holds frames, layer 1 stamps
-        for dataset in ("chaotic", TIME_SWAPPED):
-            states[dataset, layer] = rng.normal(size=(20, WIDTH))
-            shown = void ^ (dataset == TIME_SWAPPED and layer == 1)
-            states[dataset, layer][:, column] = 8.0 * shown
-    run = run_of(items, states)
-    for layer, expected in ((0, 1.0), (1, 0.0)):
-        rows = [r for r in run.comparable_rows(layer) if r["analysis"] == "time_swapped" and r["source"] == "chaotic"]
-        assert [row["value"] for row in rows] == [pytest.approx(expected, abs=0.25)]
 
 
 def test_a_sub_scenario_whose_voids_look_like_controls_is_not_caught_and_the_other_one_is() -> None:

@@ -74,14 +74,15 @@ def test_of_64_answers_without_an_abstention_the_interval_keeps_a_width() -> Non
 
 
 @pytest.mark.slow
-def test_undecided_answers_and_the_sweep_are_left_out() -> None:
+def test_undecided_answers_are_a_share_of_their_own_and_the_sweep_is_left_out() -> None:
     answers, votes = study()
     votes["abstained"] = votes["abstained"].astype(object)
     broken = (votes["scenario_id"] == "chaotic-s1") & (votes["judge"] != "a")  # one vote of three decides nothing
     votes.loc[broken, ["valid", "abstained"]] = [False, None]
     shares = whole(share_rows(answers, votes, resamples=50))
-    assert set(shares["n_scenarios"]) == {3}
-    assert shares["abstention"]["void", 10.0] == pytest.approx((7 * 0.5 + 7 * 1) / 14)
+    assert set(shares["n_scenarios"]) == {4}
+    assert shares["abstention"]["void", 10.0] == pytest.approx(0.5)  # s0 of two, in each of 14 paths
+    assert shares["undecided"]["void", 10.0] == pytest.approx(7 * 0.5 / 14)
     deep = [frame.assign(layer=5, kind="void") for frame in study() if frame is not None]
     sweep = [frame.loc[(frame["alpha"] == 10) & (frame["side"] == "control")] for frame in deep]
     both = [pd.concat(pair, ignore_index=True) for pair in zip(study(), sweep, strict=True)]

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-import shutil
-import subprocess
-import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,7 +13,6 @@ from pydantic import ValidationError
 
 from tests.build.errors import raises
 from tests.build.mechanism import STANDARD, entry, extract_all, own, patch, study
-from tests.mechanism.own_process import CELL, printed, start
 from tests.mechanism.study import PAIRS, register, tiny_entry, write_items, write_verdicts
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import tasks_for
@@ -34,7 +29,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
     STEERING_VOTES,
 )
 from traps_pipeline.mechanism.nulls import null_rows, pecs_rows
-from traps_pipeline.mechanism.probing_versions import extraction_version, steering_version
+from traps_pipeline.mechanism.probing_versions import extraction_version, joined_models, steering_version
 from traps_pipeline.mechanism.shares import effect_rows, paper_protocol_rows
 from traps_pipeline.mechanism.steering import (
     UNSTEERED,
@@ -45,12 +40,14 @@ from traps_pipeline.mechanism.steering import (
 )
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.registry.local_settings import MechanismSpec
 from traps_pipeline.models.request import WITH_TEXT
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.lineage import Lineage
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of
+from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.parquet import StageOutput
@@ -79,8 +76,8 @@ def test_a_second_extraction_computes_nothing_and_a_corrected_item_alone_is_extr
     before = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
     names = sorted(set(items["scenario_id"]))
     write_items(own, "chaotic", names, clips, **{names[0]: "Which side does the ball end on?"})
-    # control and void of one scenario of chaotic, and the same with swapped times
-    assert extract_all(own) == 4
+    # control and void of one scenario of chaotic
+    assert extract_all(own) == 2
     after = own.tables.read(HIDDEN_STATES, StatesCell("chaotic", STANDARD).partition).set_index("item_id")
     changed = before.index[(before["states_key"] != after["states_key"]).to_numpy()]
     assert sorted(changed) == [f"chaotic:{names[0]}:control", f"chaotic:{names[0]}:void"]
@@ -186,15 +183,16 @@ def test_probes_of_another_prompt_are_fitted_where_they_are_asked_for(own: Works
     for prompts in (("standard",), ("standard", "guided")):
         probes = own.mechanism.probes.model_copy(update={"prompts": prompts})
         own = own.allow(mechanism=own.mechanism.model_copy(update={"probes": probes}))
-        for name in ("probes", "probe_baselines"):
-            assert the_graph()[name].wanted(StudyPartitions(own)) == [f"tiny__{prompt}" for prompt in prompts]
+        for name, others in (("probes", [*RANDOM_WEIGHTS]), ("probe_baselines", [])):
+            expected = [f"tiny__{prompt}" for prompt in (*prompts, *others)]
+            assert the_graph()[name].wanted(StudyPartitions(own)) == expected
     guided = Extraction("tiny", "guided")
     for dataset in DATASETS:
         cell = StatesCell(dataset, guided)
         own.tables.write(HIDDEN_STATES, cell.partition, stages.extract_states(own, cell)[0], {})
     of = {each.prompt: pd.DataFrame(stages.probe_rows(own, each)) for each in (STANDARD, guided)}
     found, here = ({*of[prompt]["analysis"]} for prompt in ("standard", "guided"))
-    assert found - here == {"answerable_void", "answerable_control", "time_swapped"} and here < found
+    assert found - here == {"answerable_void", "answerable_control"} and here < found
     assert {*of["guided"]["prompt"]} == {"guided"}
     both = of["guided"].merge(of["standard"], on=["analysis", "source", "target", "layer", "scope"])
     assert not np.allclose(both["value_x"].astype(float), both["value_y"].astype(float), equal_nan=True)
@@ -240,11 +238,11 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     done = written(study, STEERING, collect_steered(study, entry, cells, along))
     # Of the two scenarios a well-posed direction comes from one, so its own taxonomy has one. chaotic: 3 doses on both
     # sides of 1 + 2 + 2 + 2 scenarios; + on both sides 3 x 2, of which the controls are asked already; 2 nulls x 2 rows
-    # at the largest dose; the sweep's 2 controls; 4 rows as they are
+    # at each dose; the sweep's 2 controls; 4 rows as they are
     rows = {cell.dataset: (len(made.rows(STEERING)), made.tally.asked) for cell, made in done}
-    assert rows["chaotic"] == rows["occlusion"] == (58, 55)
+    assert rows["chaotic"] == rows["occlusion"] == (66, 63)
     # ill-posed: 3 sources, whose controls the well-posed cell has asked: its voids are new, its nulls, and its sweep
-    assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (58, 3 * 5 + 3 * 2 + 2 * 4 + 2 * 2 + 2)
+    assert rows["chaotic_ill_posed"] == rows["occlusion_ill_posed"] == (74, 3 * 5 + 3 * 2 + 3 * 2 * 4 + 2 * 2 + 2)
     planned = count_answers(study.mechanism, "tiny", DATASETS, {"occlusion": PAIRS, "chaotic": PAIRS})
     assert planned["guided"].total() == sum(asked for _, asked in rows.values()) and set(planned) == {"guided"}
     votes = written(study, STEERING_VOTES, collect_steering_votes(study, cells))
@@ -254,37 +252,6 @@ def steered(study: Workspace, entry: ModelEntry) -> Workspace:
     ]  # controls are judged for correctness too
     assert [len(made.rows(STEERING_VOTES)) for _, made in votes] == [3 * n for n in tasks]
     return study
-
-
-def test_who_may_not_write_a_cell_makes_its_answers_and_a_killed_process_gives_its_chunk_back(
-    own: Workspace, entry: ModelEntry, tmp_path: Path
-) -> None:
-    """While this process holds the ledger, one helper is killed behind its first chunk and another one makes the rest;
-    when it may write it generates nothing twice, and its texts are those of one process alone."""
-    few = entry.model_copy(update={"limits": entry.limits.model_copy(update={"concurrency": 8})})
-    alone, made = shutil.copytree(own.root, tmp_path / "alone", symlinks=True), own.ledger_folder / "made" / "tiny"
-
-    def wait_for(files: int, process: subprocess.Popen[str]) -> int:
-        while len(done := list(made.glob("*.json"))) < files:
-            assert process.poll() is None
-            time.sleep(0.02)
-        return sum(len(json.loads(path.read_text("utf-8"))) for path in done)
-
-    async def helped() -> tuple[int, subprocess.Popen[str]]:
-        async with own.answers.writing(CELL.evaluation.key, print):
-            first = start("steer", own.root, few)
-            wait_for(1, first)
-            first.kill()
-            first.wait()
-            known = wait_for(1, second := start("steer", own.root, few))
-            assert wait_for(7, second) == 55  # 55 answers in chunks of 8
-            return known, second
-
-    known, process = asyncio.run(helped())
-    said, whole = printed(process), printed(start("steer", alone, few))
-    assert process.returncode == 0 and known >= 6 and said["made"] == 55 - known
-    assert whole["made"] == 55 and said["content"] == whole["content"]
-    assert not made.exists() and len(own.answers.read(CELL.evaluation.key).rows) == 55
 
 
 def test_no_answer_is_steered_along_a_direction_that_comes_from_its_scenario(steered: Workspace) -> None:
@@ -357,7 +324,8 @@ def test_nulls_and_policies_stand_beside_every_own_direction(steered: Workspace)
     effects = effects_of_wrong_answers(steered)
     nulls, pecs = pd.DataFrame(null_rows(effects)), pd.DataFrame(pecs_rows(effects))
     assert set(nulls["target"]) == {*DATASETS, "all"} and set(nulls["null"]) == {"covariance"}
-    assert set(nulls["draws"]) == {2} and set(nulls["unit"]) == {"gap"} and set(nulls["dose"]) == {0.5}
+    doses = {*zip(nulls["unit"], nulls["dose"], strict=True)}
+    assert set(nulls["draws"]) == {2} and doses == {("alpha", 2.0), ("alpha", 8.0), ("gap", 0.5)}
     gaps = {name: of.gaps[2] for name, of in stages.saved_directions(steered, STANDARD).items()}
     doses = effects.query("unit == 'gap' and dose == 0.5 and layer == 2")
     assert np.allclose(doses["alpha"], 0.5 * doses["source"].map(gaps).astype(float))
@@ -399,3 +367,13 @@ def test_settings_that_cannot_be_are_refused() -> None:
     ):
         with raises(ValidationError, "MechanismSettings", *named):
             MechanismSettings.model_validate(wrong)
+
+
+def test_a_row_of_states_and_answers_names_the_two_models_that_it_joins(own: Workspace, entry: ModelEntry) -> None:
+    """One precision and the same frames are one model; other frames, or NF4 inside, are two."""
+    assert joined_models(entry, own.mechanism) is None
+    packed = entry.model_copy(update={"mechanism": MechanismSpec(quantisation="nf4")})
+    assert joined_models(packed, own.mechanism) == "states: nf4, 2 frames; answers: float32, 2 frames"
+    layers = own.mechanism.models["tiny"].model_copy(update={"media": MediaSpec(profile="frames", fps=4)})
+    shown = own.mechanism.model_copy(update={"models": {"tiny": layers}})
+    assert joined_models(entry, shown) == "states: float32, 4 frames a second; answers: float32, 2 frames"

@@ -53,11 +53,16 @@ def test_a_passing_failure_is_tried_again_and_leaves_no_trace_but_the_count(tmp_
     assert (row["outcome"], row["text"], row["error"], row["attempts"]) == ("answer", "left", None, 3)
 
 
-def test_a_lasting_failure_is_an_outcome_without_text_and_is_asked_again_next_time(tmp_path: Path) -> None:
-    backend = Answering(lambda *_: TransientError("timeout"))
+@pytest.mark.parametrize(
+    ("failure", "kind"), [(TransientError("timeout"), "timeout"), (asyncio.CancelledError(), "cancelled")]
+)
+def test_a_lasting_failure_is_an_outcome_without_text_and_is_asked_again_next_time(
+    tmp_path: Path, failure: BaseException, kind: str
+) -> None:
+    backend = Answering(lambda *_: failure)
     finished = ask(tmp_path, backend)
     (row,) = finished["rows"]
-    assert (row["outcome"], row["text"], row["error"], row["attempts"]) == ("error", None, "timeout", 3)
+    assert (row["outcome"], row["text"], row["error"], row["attempts"]) == ("error", None, kind, 3)
     assert finished["tally"].errors == 1 and len(backend.calls) == 1 + QUICK.retries
     for asked in (1, 0):
         finished = ask(tmp_path, Answering())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,6 +59,22 @@ def test_calls_take_no_less_than_one_of_them_and_as_long_as_an_entry_says() -> N
     assert forecast(model(), 1, Experience(latency_s=90.0)).minutes == pytest.approx(1.5)
     assert forecast(model(expected_latency_s=30.0), 48, Experience()).minutes == pytest.approx(1.0)  # two waves of 24
     assert forecast(model(), 0, Experience()).minutes == 0
+
+
+def test_calls_take_what_the_live_check_measured_until_the_ledger_knows_better(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    here = Account(base_url="http://127.0.0.1:9/v1")
+    monkeypatch.setattr(forecasts, "load_accounts", lambda: {"gemini": here})
+    forecasts.remember_latencies(model(), here.base_url, [10.0, 20.0])  # sent at once
+    seen = forecast(model(), 48, Experience())
+    assert seen.minutes == pytest.approx(2 * 15 / 60)  # two waves of 24 calls of 15 s
+    assert seen.queued_minutes == pytest.approx(48 * 10 / 60)  # the answers came 10 s apart
+    known = forecast(model(), 48, Experience(latency_s=30.0))
+    assert (known.minutes, known.queued_minutes) == (pytest.approx(1.0), 0.0)
+    monkeypatch.setattr(forecasts, "load_accounts", lambda: {"gemini": here.model_copy(update={"base_url": None})})
+    assert forecast(model(), 48, Experience()).minutes != seen.minutes  # of that name at another address
 
 
 def test_participants_of_an_account_share_its_pace(monkeypatch: pytest.MonkeyPatch) -> None:

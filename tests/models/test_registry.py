@@ -50,7 +50,7 @@ def test_entries_keep_their_order_and_defaults(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_entry_is_named_with_its_field(tmp_path: Path, wrong: str, names: list[str]) -> None:
-    with raises(TrapsError, "base.yamlfile.parse_yaml_model", "models.yaml: ", *names):
+    with raises(TrapsError, "base.yamlfile.parse_yaml_model", "models.yaml:", *names):
         load_models(registry(tmp_path, entry("ok"), wrong))
 
 

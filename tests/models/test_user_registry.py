@@ -120,8 +120,27 @@ def test_the_workspace_keeps_what_an_experiment_brought(tmp_path: Path, monkeypa
     ],
 )
 def test_a_wrong_entry_of_ones_own_is_named_with_its_field(tmp_path: Path, old: str, new: str, field: str) -> None:
-    with raises(TrapsError, "", "mine.yaml: ", field):
+    with raises(TrapsError, "", "mine.yaml:", field):
         load_experiment(written(tmp_path, MINE.replace(old, new)))
+
+
+TWO_JUDGES = """judges:
+  - {id: judge-a, base_url: "http://127.0.0.1:9/v1"}
+  - {id: judge-b, base_url: "http://127.0.0.1:9/v1"}
+"""
+
+
+@pytest.mark.parametrize(
+    ("judges", "line", "twice"),
+    [
+        (TWO_JUDGES.replace("judge-b", "judge-a"), 1, "'judge-a'"),  # two entries of one id
+        (f"{TWO_JUDGES}panels:\n  none-asks-it: [judge-a, judge-a, judge-b]\n", 5, "'judge-a', 'judge-a', 'judge-b'"),
+    ],
+)
+def test_a_judge_twice_is_refused_in_its_line(tmp_path: Path, judges: str, line: int, twice: str) -> None:
+    path = written(tmp_path, f"{judges}name: mine\nmodels: [oracle]\npanel: rules\n")
+    with raises(TrapsError, "", f"mine.yaml:{line}: ", twice):
+        load_experiment(path)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +157,7 @@ def test_a_wrong_entry_of_ones_own_is_named_with_its_field(tmp_path: Path, old: 
     ],
 )
 def test_a_key_that_stands_in_an_entry_is_refused_and_not_repeated(tmp_path: Path, old: str, new: str) -> None:
-    with raises(TrapsError, "", "mine.yaml: ") as raised:
+    with raises(TrapsError, "", "mine.yaml:") as raised:
         load_experiment(written(tmp_path, MINE.replace(old, new)))
     assert "0123456789" not in str(raised.value)
 

@@ -31,14 +31,14 @@ _DECIDED_BY: dict[str, tuple[str, ...]] = {
     "hidden_states": ("mechanism/hidden_states.py", "models/local/capture.py"),
     "probes": ("mechanism/probes.py", "mechanism/probing.py"),
     "probe_baselines": ("mechanism/baselines.py",),
-    "steering": ("mechanism/steering.py", "mechanism/hook.py", "mechanism/shared_answers.py"),
+    "steering": ("mechanism/steering.py", "mechanism/hook.py"),
+    "steering_fluency": ("mechanism/fluency.py",),
     "steering_votes": ("mechanism/steering.py",),
     "steering_effects": ("mechanism/shares.py", "mechanism/effects.py"),
     "steering_shares": ("mechanism/shares.py",),
     "steering_nulls": ("mechanism/nulls.py",),
     "steering_pecs": ("mechanism/nulls.py",),
     "gate": ("mechanism/gate.py", "mechanism/gating.py"),
-    "risk_coverage": ("mechanism/gate.py", "mechanism/gating.py"),
     "patching": ("mechanism/patching_effects.py", "mechanism/patching_stage.py"),
 }  # else the module of the stage's own name
 

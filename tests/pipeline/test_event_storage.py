@@ -6,8 +6,6 @@ from pathlib import Path
 import dagster as dg
 import pytest
 from dagster._core.storage.sqlite_storage import DagsterSqliteStorage
-from sqlalchemy import Engine
-from sqlalchemy.event import listen, remove
 
 from traps_pipeline.base.paths import ASSETS, ROOT
 
@@ -47,25 +45,6 @@ def test_each_commit_touches_the_file_that_a_page_watches(home: Path) -> None:
     with dg.DagsterInstance.from_config(str(home)) as instance:
         dg.GraphDefinition(name="job", node_defs=[look]).to_job().execute_in_process(instance=instance)
     assert touched == sorted(set(touched))
-
-
-@pytest.mark.promise
-def test_only_the_first_event_looks_up_which_tables_and_columns_there_are(home: Path) -> None:
-    asked = list[str]()
-
-    def note(connection: object, cursor: object, statement: str, *_: object) -> None:
-        asked.append(statement)
-
-    listen(Engine, "before_cursor_execute", note)
-    try:
-        with dg.DagsterInstance.from_config(str(home)) as instance:
-            for number in range(2):
-                asked.clear()
-                instance.report_runless_asset_event(dg.AssetMaterialization(answer.key))
-                is_lookup = [statement.lstrip().startswith("PRAGMA") for statement in asked]
-                assert asked and any(is_lookup) == (number == 0), asked
-    finally:
-        remove(Engine, "before_cursor_execute", note)
 
 
 @pytest.mark.slow

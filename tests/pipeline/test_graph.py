@@ -88,8 +88,8 @@ def test_what_can_cost_money_is_marked() -> None:
     paid = {"responses", "votes", "confabulation", "steering_votes"}
     assert {s.name for s in GRAPH.stages if s.cost == "money"} == paid
     assert {s.name for s in GRAPH.stages if s.cost == "machine"} == {
-        *("hidden_states", "steering"),
-        *("probe_baselines", "gate", "risk_coverage", "lens", "item_scores", "sentences", "patching"),
+        *("hidden_states", "steering", "steering_fluency"),
+        *("probe_baselines", "gate", "leads", "lens", "item_scores", "sentences", "patching"),
     }
 
 

@@ -134,7 +134,8 @@ def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(stud
         for last in (False, False, True):  # a new process has reported nothing yet
             if last:
                 path.unlink()
-            report_unseen(instance, RunPlan(study), {})
+            report_unseen(instance, RunPlan(study), reported := dict[str, str]())
+            assert reported and str(tmp_path) not in str(reported)  # the page of the sensor shows its cursor
         key = dg.AssetCheckKey(dg.AssetKey("verdicts"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     found = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore

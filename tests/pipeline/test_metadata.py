@@ -14,6 +14,7 @@ from tests.mechanism.study import filled
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.mechanism.control_rows import GATE
+from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.metadata import errors_for_pages, preview, tally_metadata, tally_of, visible_metadata
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -33,6 +34,13 @@ def test_rows_are_shown_with_their_short_texts_and_without_long_ones() -> None:
     shown = preview(ITEMS, StageOutput(items))["first rows"]
     assert [record.data["side"] for record in shown.records] == ["control", "void"]
     assert not shown.records[0].data.keys() & {"question", "labels", "dataset"}  # long; a list; the partition's own
+
+
+def test_the_beginning_of_each_answer_is_shown() -> None:
+    answers = [row(RESPONSES, item_id=str(n), text=text) for n, text in enumerate(["It falls. " * 20, "Left.", None])]
+    shown = preview(RESPONSES, StageOutput(answers))["first rows"]
+    assert [record.data["text"] for record in shown.records] == ["It falls. " * 6, "Left.", "None"]
+    assert answers[0].text == "It falls. " * 20
 
 
 def test_work_is_numbers_that_dagster_plots_and_that_are_read_back() -> None:

@@ -1,4 +1,4 @@
-"""The claims in the pocket's card: figures of a study, worked out by hand, and whether they tell models apart."""
+"""The claims in the pocket's card: figures of a study, worked out by hand, and whether they hold in its controls."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pandas as pd
 import pytest
 
 from tests.build.controls import Made, frame
-from tools.pocket.claims import CLAIMS, markdown
+from tools.pocket.claims import markdown
 from tools.pocket.commands import MECHANISM
 from tools.pocket.recipe import SHIPPED
 from tools.pocket.seeds import Figure, read_seeds
 from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
+from traps_pipeline.report.tables.claims import CLAIMS, claim_frame
 
 pytestmark = pytest.mark.slow
 
@@ -21,16 +22,17 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("folder", SHIPPED.values(), ids=[*SHIPPED])
 def test_every_claim_is_measured_in_both_models(folder: Path) -> None:
     figures = read_seeds(folder / MECHANISM, Figure)
-    assert {figure.claim for figure in figures} == {claim.name for claim in CLAIMS}
+    assert {figure.claim for figure in figures if figure.subject == "model"} == {claim.name for claim in CLAIMS}
 
 
 def test_figures_of_claims_by_hand() -> None:
-    """Two voids, both answered, both encoded: the margin orders three of four pairs of a void and a control, whole
-    abstentions one and a tie. Guided takes voids from 3 to 9 above controls. One cell is ahead of its null."""
-    expected = {"unsaid": 1.0, "order": 0.25, "sentence": 0.625, "answer": 0.625, "lens": 6.0, "ahead": 1.0}
-    expected |= {"gate": None, "risk": None}  # nothing was gated under standard
-    values = {claim.name: claim.of(Made()) for claim in CLAIMS if claim.name in expected}
-    assert values == {name: value if value is None else pytest.approx(value) for name, value in expected.items()}
+    """Two voids, both answered, both encoded, and no control is: the share is 1. States order all four pairs of a void
+    and a control, whole abstentions one and a tie. Guided takes voids from 3 to 9 above controls. States have .9, the
+    best rival .7, the logits .65. The gate is on states and on words alike, under guided alone."""
+    expected = {"unexpressed": 1.0, "sentence": 0.625, "lens": 6.0, "lead_visual": 0.2, "output": 0.25, "residual": 0.8}
+    found = claim_frame(Made()).set_index("claim")["in_model"]
+    assert {name: found[name] for name in expected} == pytest.approx(expected)
+    assert found[["gate", "lead_textual", "ahead", "direction"]].isna().all()
 
 
 class Steered(Made):
@@ -39,7 +41,7 @@ class Steered(Made):
     @cached_property
     def effects(self) -> pd.DataFrame:
         along = {"regime": "guided", "source": "chaotic", "target": "chaotic", "layer": 3, "alpha": 40.0}
-        rows = [along | {"side": "void", "directions": "guided"}, along | {"side": "void", "directions": "standard"}]
+        rows = [along | {"side": "void", "directions": name, "abstention": 0.0} for name in ("guided", "standard")]
         for directions, abstained, n, missing, other in (
             ("guided", 3, 4, 1, {}),
             ("standard", 1, 1, 4, {}),
@@ -47,27 +49,30 @@ class Steered(Made):
             ("guided", 0, 5, 0, {"alpha": 20.0}),
             ("guided", 0, 5, 0, {"source": "occlusion"}),
         ):
-            counts = {"side": "control", "directions": directions, "abstained": abstained, "n": n, "n_missing": missing}
+            counts = {"side": "control", "directions": directions, "abstention": abstained / (n + missing)}
             rows.append(along | counts | other)
         return frame(STEERING_EFFECTS, *rows)
 
 
 def test_one_dose_is_compared_along_directions_of_both_prompts() -> None:
     (followed,) = (claim for claim in CLAIMS if claim.name == "followed")
-    assert followed.of(Steered()) == pytest.approx(3 / 5 - 1 / 5)
+    assert followed.of(Steered(), "m", "model") == pytest.approx(3 / 5 - 1 / 5)
 
 
-def test_a_stage_tells_models_apart_if_its_claim_holds_in_every_seed_of_one_and_in_none_of_the_other() -> None:
-    (claim, *_) = CLAIMS
+def test_the_card_holds_a_claim_in_the_worst_seed_of_the_model_and_the_best_of_its_controls() -> None:
+    (claim,) = (claim for claim in CLAIMS if claim.name == "output")
+    bound, above, below = claim.bound, claim.bound + 0.1, claim.bound - 0.1
 
-    def told(gap: list[float], no_gap: list[float]) -> str:
-        of = [[Figure(n, "w", claim.name, value) for n, value in enumerate(values)] for values in (gap, no_gap)]
-        lines = markdown(*of).splitlines()
-        assert len(lines) == 3 and lines[2].startswith(f"| {claim.stage}: {claim.says} |")
+    def printed(gap: dict[str, list[float]], no_gap: list[float]) -> str:
+        figures = [Figure(n, "w", claim.name, s, value) for s, values in gap.items() for n, value in enumerate(values)]
+        others = [Figure(n, "w", claim.name, "model", value) for n, value in enumerate(no_gap)]
+        lines = markdown(figures, others).splitlines()
+        assert len(lines) == 3 and lines[2].startswith(f"| {claim.says} | {claim.figure} \u2265 {bound:g} | ")
         return lines[2].split(" | ")[-1].removesuffix(" |")
 
-    bound, above, below = claim.bound, claim.bound + 0.1, claim.bound - 0.1
-    assert told([bound, above], [below, below]) == "yes"
-    assert told([above, below], [below]) == told([above], [below, bound]) == told([below], [below]) == "no"
-    assert told([below, below], [above, bound]) == "the other way"
-    assert claim.stage not in markdown([], [])  # a claim that was not measured has no row
+    assert printed({"model": [bound, above], "random_0": [below], "placebo": [below]}, [below, below]) == "holds"
+    assert printed({"model": [bound, below]}, [below]) == "does not hold"
+    assert printed({"model": [above], "random_0": [below], "random_1": [below, bound]}, []) == "holds in random 1 too"
+    assert printed({"model": [above]}, [below, bound]) == "holds in pocket, no gap too"
+    assert printed({"model": [above]}, []) == "no control"
+    assert claim.says not in markdown([], [])  # a claim that was not measured has no row

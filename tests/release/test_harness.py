@@ -17,12 +17,13 @@ from tests.build.errors import raises
 from tests.build.harness import ours
 from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.held_out import opaque
+from traps_pipeline.benchmark.held_out import held_out_key, opaque
 from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
+from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.harness.scoring import RUN_FIGURES, figures, judge
 from traps_pipeline.release.harness.write import MEDIA_SETTINGS, media_settings, rewritten_source, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -92,7 +93,7 @@ def test_its_items_prompts_and_frames_are_those_that_a_model_is_sent(
 ) -> None:
     package = harness / "traps_harness"
     about = json.loads((package / "about.json").read_text())
-    assert about["prompts"] == {regime: system_prompt(regime) for regime in ("guided", "json", "standard")}
+    assert about["prompts"] == {regime: system_prompt(regime) for regime in REGIMES if regime != "logprobs"}
     assert about["parameters"] == {"temperature": 0.8, "top_p": 0.95, "max_tokens": 8000}
     items = {row["item_id"]: row for row in map(json.loads, (package / "items.jsonl").read_text().splitlines())}
     asked = workspace.tables.read_all(ITEMS).to_dict("records")
@@ -155,18 +156,28 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
     unasked: Checkout, answers: Path, tmp_path: Path
 ) -> None:
     given = json.loads(answers.read_text())["json"]["random-50"]
-    workspace, key = Workspace.open(unasked.workspace), bytes(32)
+    workspace, key = Workspace.open(unasked.workspace), held_out_key(tmp_path / "key", make=True)
     ids = sorted(workspace.tables.read_all(ITEMS)["item_id"])
     lines = [{"item": opaque(key, id_), "regime": "json", "text": given[id_]} for id_ in ids]
     path = tmp_path / "answers.jsonl"
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (tmp_path / "key").write_text("00" * 32)
     command = ("study", "import-answers", unasked.root / EXPERIMENT, path, "--model", "random-50")
-    refused = unasked.traps(*command)
-    assert (refused.code, refused.raised) == (1, "exchange.answer_exchange._answers_by_item")
-    assert [name for name in (lines[0]["item"], "json", "random-50") if name not in refused.err] == []
-    finished = unasked.traps(*command, "--key", tmp_path / "key")
-    assert finished.code == 0 and finished.out.startswith("48 "), finished.err
+    plain = [line | {"item": id_} for line, id_ in zip(lines, ids, strict=True)]
+    failed = [line | {"text": "Error: 429 Too Many Requests"} for line in lines]
+    keyed, by = ("--key", tmp_path / "key"), "exchange.answer_exchange."
+    for given_lines, with_key, raised in (
+        (lines, (), "_answers_by_item"), (plain, keyed, "_answers_by_item"), (failed, keyed, "import_answers")
+    ):  # fmt: skip
+        path.write_text("".join(json.dumps(line) + "\n" for line in given_lines))
+        refused = unasked.traps(*command, *with_key)
+        assert (refused.code, refused.raised) == (1, by + raised)
+        assert [name for name in (lines[0]["item"], ids[0]) if name in refused.err] == [given_lines[0]["item"]]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    scored = tmp_path / "key.scored"
+    for new, known in ((48, 0), (0, 48)):
+        finished = json.loads(unasked.traps(*command, *keyed, "--json").ok().out)
+        assert (finished["new"], finished["known"], len(scored.read_text().split())) == (new, known, 1)
+    path.write_text(json.dumps(lines[0]) + "\n")
+    assert " 2 files" in unasked.traps(*command, *keyed).ok().err
     assert imported_texts(workspace, "random-50", "json") == {id_: given[id_] for id_ in ids}
 
 

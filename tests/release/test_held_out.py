@@ -17,18 +17,27 @@ import numpy as np
 import pytest
 
 from tests.build.errors import raises
-from tests.conftest import Checkout, copy_of
+from tests.conftest import ROOT, Checkout, copy_of
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark import held_out
-from traps_pipeline.benchmark.held_out import MARKER, drawn_items, held_out_key, require_secret_seed
+from traps_pipeline.benchmark.held_out import (
+    MARKER,
+    begin_publication,
+    drawn_items,
+    held_out_items,
+    held_out_key,
+    mark_held_out,
+    require_secret_seed,
+)
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.two_events import LaneItem, lane_item, lane_items
 from traps_pipeline.release.content import Content, content_of
 from traps_pipeline.release.folder import Options, write_release
-from traps_pipeline.storage.benchmark_tables import VIDEOS
+from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import decode, frames_digest
 
@@ -246,7 +255,7 @@ def test_nothing_with_sides_is_published_of_a_study_whose_items_are_held_out(dem
     for command in commands:
         finished = study.traps(*command)
         assert finished.code == 1 and not out.exists() and len(finished.err.splitlines()) == 1, command
-        assert finished.raised in ("benchmark.held_out.refuse_held_out", "benchmark.held_out.mark_held_out")
+        assert finished.raised in ("benchmark.held_out.begin_publication", "benchmark.held_out.mark_held_out")
     study.traps("publish", "release", held, "--without-answers", key).ok()  # the same again
     marker.unlink()
     study.traps("publish", "submit", out, "--name", "mine").ok()
@@ -316,15 +325,66 @@ def test_a_map_of_another_release_is_not_overwritten(content: Content, tmp_path:
     assert (tmp_path / "key.items.jsonl").read_text() == "{}\n"
 
 
-@pytest.mark.parametrize(("name", "is_told"), [("private-2026", True), ("lab", False), ("lab-12026", False)])
-def test_a_name_that_holds_the_seed_of_a_private_benchmark_is_refused(tmp_path: Path, name: str, is_told: bool) -> None:
-    (tmp_path / "released").mkdir()
-    draws = {"plinko": {"seed": 2026, "wanted": 1, "draws": 1, "rejected": {}}}
-    (tmp_path / "released" / "draws.json").write_text(json.dumps(draws))
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("lab-4702163958821407365", 4702163958821407365), ("lab-4142-3b82-12cd-be85", 0x41423B8212CDBE85),
+        ("lab", 2026), ("lab", 2**48 - 3), ("lab", 2026112820261128), ("lab", 1234567890123456789), ("lab", 10**18),
+    ],
+)  # fmt: skip
+def test_a_seed_of_a_private_benchmark_that_is_told_or_guessed_is_refused(tmp_path: Path, name: str, seed: int) -> None:
+    with raises(TrapsError, "benchmark.held_out.require_secret_seed", str(tmp_path)):
+        require_secret_seed(private_benchmark(tmp_path, name, seed))
+    require_secret_seed(private_benchmark(tmp_path / "remedied", "lab-12026", 4702163958821407365))
+
+
+def private_benchmark(folder: Path, name: str, seed: int) -> Path:
+    (folder / "released").mkdir(parents=True)
+    draws = {"plinko": {"seed": seed, "wanted": 1, "draws": 1, "rejected": {}}}
+    (folder / "released" / "draws.json").write_text(json.dumps(draws))
     canary = f"{name.upper()}:CANARY:7c1b9a52-2026-4b7f-9a64-2f5d8e0c41b6"
-    (tmp_path / "benchmark.yaml").write_text(f"name: {name}\nversion: 1.0.0\ncanary: '{canary}'\n")
-    if is_told:
-        with raises(TrapsError, "benchmark.held_out.require_secret_seed", str(tmp_path / "benchmark.yaml")):
-            require_secret_seed(tmp_path)
-    else:
-        require_secret_seed(tmp_path)
+    (folder / "benchmark.yaml").write_text(f"name: {name}\nversion: 1.0.0\ncanary: '{canary}'\n")
+    return folder
+
+
+def test_a_private_benchmark_is_published_with_its_sides_or_held_out_and_copies_of_its_folders_are_known(
+    content: Content, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(held_out, "SCENE_SPECS", tmp_path / "private")
+    drawn, otherwise = (drawn_items(content.items, bytes([seed]) * 32) for seed in (0, 1))
+    begin_publication(tmp_path / "study", "a submission")
+    with raises(TrapsError, "benchmark.held_out.mark_held_out", "a submission", "published.txt"):
+        mark_held_out(tmp_path / "copied-study", drawn)
+    (note,) = (tmp_path / "state" / "traps").iterdir()
+    note.unlink()  # as the message says
+    mark_held_out(tmp_path / "study", drawn)
+    monkeypatch.setattr(held_out, "SCENE_SPECS", tmp_path / "copied")  # before the release, so that it has no marker
+    copy = tmp_path / "copied-study"
+    with raises(TrapsError, "benchmark.held_out.begin_publication", "the explorer"):
+        begin_publication(copy, "the explorer")
+    with raises(TrapsError, "benchmark.held_out.mark_held_out"):
+        mark_held_out(copy, otherwise)
+    assert {*held_out_items(copy).values()} == {row["item_id"] for row in drawn}
+    assert stat.S_IMODE(next((tmp_path / "state" / "traps").iterdir()).stat().st_mode) == 0o600
+    mark_held_out(copy, drawn)
+
+
+def test_a_participant_who_answered_all_is_complete_though_a_dataset_has_no_drawn_item(tmp_path: Path) -> None:
+    study = Checkout(ROOT, tmp_path / "study")
+    study.workspace.mkdir()
+    drawn = ["occlusion:domino_chain-0001:control", "occlusion:domino_chain-0002:void"]
+    (study.workspace / MARKER).write_text(json.dumps(drawn))
+    scenarios = "scenarios: [domino_chain-0001, domino_chain-0002]\n"
+    (tmp_path / "held.yaml").write_text(
+        f"name: held\nmodels: [oracle]\nregimes: [standard]\nruns: [1]\npanel: rules\n{scenarios}"
+    )
+    study.traps("run", tmp_path / "held.yaml").ok()
+    tables = Workspace.open(study.workspace).tables
+    board = tables.read_all(LEADERBOARD)
+    columns = ["dataset", "n_pairs", "n_missing", "answered", "incomplete", "pecs", "rank"]
+    assert board[columns].to_numpy().tolist() == [["occlusion", 2, 0, 1.0, False, 1.0, 1]]
+    assert (
+        tables.state(ITEMS, {"dataset": "occlusion_ill_posed"}) and sorted(tables.read_all(ITEMS)["item_id"]) == drawn
+    )
+    assert "incomplete" not in (study.workspace / "reports" / "leaderboard.md").read_text()

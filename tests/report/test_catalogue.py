@@ -16,6 +16,7 @@ from tests.build.boards import board_of, board_row, leaderboard_section
 from tests.build.cells import row
 from tests.build.latex import latex_cells
 from tests.conftest import ROOT
+from traps_pipeline.base.archives import unpack
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.pipeline.graph import the_graph
@@ -339,7 +340,7 @@ def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():
     while new := {child for name in new for child in the_graph().below(name)} - below:
         below |= new
     not_the_panels = {"confabulation_prevalence", "human_row", "human_agreement", "panel_errors"}
-    not_the_panels |= {"probes", "probe_baselines"}  # verdicts choose the items of Cf->Cf
+    not_the_panels |= {"probes", "probe_baselines", "leads"}  # verdicts choose the items of Cf->Cf
     reads = {stage for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for stage in report.reads}
     assert (reads & below) - not_the_panels == JUDGED_STAGES
 
@@ -374,6 +375,10 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     assert {path for path in files if path.split("/")[0] in ("tables", "figures")} <= linked
     assert all((tmp_path / path).is_file() for path in linked)
     assert '<p class="absent">' in leaderboard_section((tmp_path / "report.html").read_text())
+    out = tmp_path / "one.zip"
+    assert main(["results", "export", str(out), "--workspace", str(workspace.root)]) == 0
+    packed = {name: content for name, content in unpack(out.read_bytes()).items() if not name.endswith(".pdf")}
+    assert packed == {name: (tmp_path / name).read_bytes() for name in packed} and {*packed} <= files
 
 
 @pytest.mark.slow

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from tests.build.controls import Made, effects, gate, patching, probes
+from tests.build.controls import Made, effects, gate, item_scores, patching, probes
 from traps_pipeline.report import publish, study_results
-from traps_pipeline.report.cards import Sources
-from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE
+from traps_pipeline.report.cards import Sources, figure_card, table_card
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, TABLE_REPORTS
+from traps_pipeline.report.figures.looks import arrow
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import control_reports
+from traps_pipeline.report.tables.claims import Claim, claim_frame, verdict
+from traps_pipeline.report.tables.claims import claims as claim_tables
 from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.tables.patching_tables import patching as patching_table
 from traps_pipeline.report.tables.steering_tables import steering as steering_tables
@@ -30,27 +35,47 @@ def cells(table: PrintedTable) -> list[dict[str, str]]:
     return [dict(zip(headings, row, strict=True)) for row in table.cells]
 
 
-def test_probes_stand_beside_their_baselines_at_the_sources_own_layer() -> None:
-    beside, look_alikes = control_reports.probe_baselines(Made())
-    own, across = cells(beside)
-    assert (own["Path"], own["Layer"], own["States"], own["from"]) == ("ch→ch", "3", "0.980", "0.790")
-    assert (own["Time stamps"], own["Output margin"], own["Noise"]) == ("1.000", "0.900", "0.500 ± 0.100")
-    assert across["Path"] == "ch→oc" and across["Time stamps"] == "–"
-    (row,) = cells(look_alikes)
-    assert (row["Items"], row["Time stamps"]) == ("frame times of the other side", "1.000")
+def test_a_claim_is_held_only_where_no_control_that_must_fail_holds_too() -> None:
+    claim = Claim("x", "says", "figure", 0.1, lambda *_: None, ("random_0", "placebo"))
+    for values, expected in (
+        ({"model": 0.1, "random_0": 0.09, "placebo": 0.0, "random_1": 0.9}, "holds"),
+        ({"model": 0.1, "random_0": 0.1, "placebo": 0.0}, "holds in random 0 too"),
+        ({"model": 0.3, "random_0": 0.2, "placebo": 0.2}, "holds in random 0, placebo too"),
+        ({"model": 0.3, "no_gap": 0.0}, "no control"),
+        ({"model": 0.09, "random_0": 0.2}, "does not hold"),
+        ({"random_0": 0.2}, "not measured"),
+    ):
+        assert verdict(claim, values) == expected
+
+
+def test_claims_stand_beside_random_weights_placebos_and_the_best_rival() -> None:
+    table, rivals = claim_tables(Made())
+    rows = {row["Claim"]: row for row in cells(table)}
+    lead = rows["states tell visual voids better than all rivals"]
+    assert [lead[name] for name in ("model", "random 0", "random 1", "placebo")] == ["0.200", "0.150", "–", "0.050"]
+    assert lead["Verdict"] == "holds in random 0 too"
+    assert rows["states tell visual voids better than the output"]["model"] == "0.250"  # .9 less .65 of the logits
+    own, *_ = cells(rivals)
+    assert (own["States"], own["Question words"], own["Best rival"], own["Lead"]) == (
+        "0.900", "0.700", "question words", "0.200",
+    )  # fmt: skip
+
+
+def test_a_row_that_joins_two_models_is_left_out_of_claims() -> None:
+    made = Made()
+    made.item_scores = item_scores().assign(joins="states: nf4, 25 frames; answers: bfloat16, 16 frames")
+    rows = claim_frame(made).set_index("claim")
+    made.gate = gate().assign(joins="states: nf4, 25 frames; answers: bfloat16, 16 frames")
+    assert any(note.startswith("m joins two models (states: nf4") for note in control_reports.gate(made)[0].notes)
+    for name in ("unexpressed", "sentence"):
+        assert rows.loc[name, "verdict"].startswith("two models (states: nf4") and np.isnan(rows.loc[name, "in_model"])
+    assert rows.loc["lead_visual", "verdict"] == "holds in random 0 too"
 
 
 def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
-    sources, controls, answerable, _ = control_reports.gate(Made())
+    sources, _ = control_reports.gate(Made())
     assert [row["Target"] for row in cells(sources)] == ["all", "ch"]
-    assert [(row["Controls"], row["Voids"]) for row in (*cells(sources), *cells(controls))] == [("64", "64")] * 4
-    assert [(row["Features"], row["PECS, gated"]) for row in cells(controls)] == [
-        ("states", "0.640"),
-        ("question words", "0.640"),
-    ]
-    (row,) = cells(answerable)
-    assert (row["Abstained on %"], row["n"]) == ("40.0 †", "8") and any(n.startswith("†") for n in answerable.notes)
-    assert row["Items"].startswith("whole clip")
+    assert [(row["Controls"], row["Voids"]) for row in cells(sources)] == [("64", "64")] * 2
 
 
 def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
@@ -101,12 +126,10 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
 
 # The numbers of each sentence, in their order.
 FINDINGS = {
-    "states_and_output": "2 2 0 2 0 1.00 0.75 0.38",  # answered; states of voids, of controls; output; as orders
+    "claims": "3 17",  # above the shipped figures of the pocket without the gap, and in no other control
+    "leads": "0.90 0.70 +0.20 +0.05 +0.30",
     "lens": "+3.0 +9.0 +1.0 +1.0",  # standard, guided; one layer before
-    "probe_baselines": "0 1 0 1",
-    "gate_arrows": "0.45 0.64 0.64",
     "patching": "0.99 0 1 1 0.99 0 1 1",  # share, layer, panels of panels
-    "doses_among_nulls": "19 20 1 1 1 80 % 5",
 }
 
 
@@ -129,7 +152,7 @@ def test_the_page_of_a_study_that_looked_inside_leads_with_the_four_figures_of_i
     order = [report.name for report in FIGURE_REPORTS]
     assert shown(None) == order and order[: len(INSIDE)] != [*INSIDE]
     inside = shown(MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)}))
-    assert inside[:3] == ["states_and_output", "lens", "probe_baselines"] == [*INSIDE[:3]]
+    assert inside[:3] == ["claims", "leads", "lens"] == [*INSIDE[:3]]
     assert inside == [*INSIDE, *(name for name in order if name not in INSIDE)]
 
 
@@ -145,6 +168,30 @@ def test_steered_cells_have_their_dose_in_class_gaps_their_counts_and_what_is_no
     assert [line["in class gaps"] for line in cells(found["steering_dose"])] == ["0.00", "0.05"]
     for name in ("steering_top", "steering_dose", "steering_regimes", "steering_domains"):
         assert {"n =", "†"} <= {re.split(r" \w", note)[0] for note in found[name].notes}, name
+
+
+def test_a_figure_or_table_that_cannot_be_made_is_named_with_its_models_and_the_others_are_made() -> None:
+    made = Made()
+    made.overall = pd.DataFrame({"model": ["m"]})
+    made.leads = made.leads.drop(columns="target")
+    sources = cast(Sources, SimpleNamespace(study=made))
+    by_name = {report.name: report for report in FIGURE_REPORTS}
+    broken, sound = (figure_card(by_name[name], sources) for name in ("leads", "lens"))
+    assert not broken.html and broken.why.startswith("figure leads of m: ") and "KeyError" in broken.why
+    assert sound.html and not sound.why
+    (table,) = (report for report in TABLE_REPORTS if report.name == "claims")
+    assert table_card(table, sources).why.startswith("table claims of m: ")
+
+
+def test_an_arrow_from_or_to_an_undefined_point_is_left_out_and_the_figure_is_saved() -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    axes = figure.add_subplot()
+    for start, end in (((0.1, 0.2), (float("nan"), 0.5)), ((float("nan"), 0.2), (0.3, 0.5)), ((0.1, 0.1), (0.4, 0.5))):
+        arrow(axes, start, end, "black")
+    figure.savefig(io.BytesIO())
+    assert len(axes.texts) == 1
 
 
 def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:

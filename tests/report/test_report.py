@@ -23,7 +23,7 @@ from traps_pipeline.report.figures.landscape import landscape_figure
 from traps_pipeline.report.leaderboard_page import BOUNDS, leaderboard_markdown, leaderboard_text, leaderboards
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.worked_example import Example, chosen_example, example_figure, reading
-from traps_pipeline.report.writing import figure_bytes, fraction, percent, table_latex
+from traps_pipeline.report.writing import NotRun, figure_bytes, fraction, percent, table_latex
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.video.encode import encode
 
@@ -74,14 +74,16 @@ def test_text_lists_models_by_overall_pecs_with_their_interval(board):
     assert lines[0].startswith("Overall. ")
     assert {"three", "1", "v1", "e1"} <= {*re.findall(r"\w+", lines[0])}  # panel, its version, the benchmark's, epoch
     text = tables(shown)[0]
-    assert [row["Model"] for row in text[:4]] == ["oracle"] * 3 + ["mid"]
-    assert (text[0]["PECS"], text[0]["95 % CI"], text[0]["Acc %"]) == ("1.000", "[1.000, 1.000]", "100.0")
+    # Reference rows are no models: they come last, however high their score, below a heading.
+    assert [row["Model"] for row in text[:5]] == ["mid", "Reference rows"] + ["oracle"] * 3
+    assert (text[2]["PECS"], text[2]["95 % CI"], text[2]["Acc %"]) == ("1.000", "[1.000, 1.000]", "100.0")
+    assert {*filter(None, text[1].values())} == {"Reference rows"}
     # Acc 0.5, J 0.6 - 0.1 = 0.5, PECS 0.25; no dataset of its own is on the board.
-    assert text[3].items() >= {
+    assert text[0].items() >= {
         "PECS": "0.250", "95 % CI": "[0.200, 0.300]", "Acc %": "50.0", "AbsRec %": "60.0", "FalseAbs %": "10.0",
         "J": "0.500", **dict.fromkeys(PECS_OF.values(), "–"), "n": "1404", "Missing": "0",
     }.items()  # fmt: skip
-    assert len({len(x) for x in lines[2:-2]}) == 1
+    assert len({len(x) for x in lines[2:-2] if x != "Reference rows"}) == 1
     assert lines[-1].startswith("– ")
 
 
@@ -130,6 +132,20 @@ def test_votes_that_code_decides_unlike_their_judges_are_counted_and_marked_abov
     ):  # 1,000 controls
         by_model = {row["Model"]: row.get("Overruled") for row in rows}
         assert by_model == {"m": shown, "rules": None if shown is None else "–"}
+
+
+def test_a_board_of_which_a_fifth_is_missing_says_first_why_and_what_to_change():
+    counts = {"n_missing": 26, "n_truncated": 11, "n_empty": 10, "n_unread": 5}
+    lacking = {"n_runs": 1, "n_pairs": 16} | counts
+    rows = [board_row("fine", dataset="occlusion"), board_row("m", dataset="occlusion", **lacking)]
+    board = board_of(*rows, board_row("m", **lacking))
+    first = leaderboard_text(board).splitlines()[0]
+    assert first.startswith("m: 11 of 32 answers were cut off, 10 empty, 5 unread: raise its limit of tokens")
+    assert leaderboard_markdown(board).startswith(first)
+    a_fifth = board_row("m", dataset="occlusion", n_runs=1, n_pairs=15, n_missing=6, n_errors=6)
+    assert leaderboard_text(board_of(a_fifth)).startswith("Occlusion. ")
+    more = board_of(a_fifth | {"n_missing": 9, "n_errors": 1})
+    assert leaderboard_text(more).startswith("m: 8 of 30 answers were undecided by the panel, 1 not given")
 
 
 def test_marks_and_columns_are_away_where_nothing_calls_for_them():
@@ -225,11 +241,12 @@ def test_html_names_the_epoch_in_each_row_where_rows_differ():
     assert '<td class="word">e2</td>' in page
 
 
-def test_an_empty_board_still_gives_a_page_a_table_and_a_figure():
+def test_an_empty_board_still_gives_a_page_and_a_table_and_no_empty_figure():
     board = pd.DataFrame(columns=pd.Index(LEADERBOARD.names))
     (table,) = leaderboards(board)
     assert table.absence and table.absence in report_html(board) and table.absence in leaderboard_text(board)
-    assert figure_bytes(landscape_figure(points(board), "Overall")).startswith(b"\x89PNG")
+    with pytest.raises(NotRun):
+        landscape_figure(points(board), "Overall")
 
 
 def test_no_two_labels_of_the_landscape_overlap(board):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.difficulty import tracked
 from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.records import two_events_lines
@@ -18,6 +19,7 @@ from traps_pipeline.scenes.parts.wording import lane_asked, lane_question
 from traps_pipeline.scenes.physics.kit import COLOURS
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lanes import BENCH_RGBA
+from traps_pipeline.scenes.worlds.timetable import Timetable
 from traps_pipeline.video.encode import encode
 
 SCENE, BENCH = (slice(100, 150), slice(80, 240)), (slice(220, 270), slice(80, 240))  # rows, columns of a lane's boards
@@ -73,3 +75,14 @@ def test_the_observer_answers_about_seen_lanes_and_abstains_about_hidden_ones(sc
             encode([*renderer.frames(world.clip(hidden))], tmp_path / f"{clip}.mp4", world.physics.fps)
     read = {asked.item: observe(tmp_path / f"{asked.item.clip}.mp4", asked.text) for asked in spec.questions()}
     assert read == {asked.item: asked.answer for asked in spec.questions()}
+
+
+@pytest.mark.slow
+def test_a_tracker_reads_what_a_window_shows_it_and_what_it_was_told_at_first_where_no_frame_falls_into_it():
+    spec = two_events_lines(TWO_EVENTS_RELEASED)["slide-e001"].spec
+    world = spec.world(trajectories_of(spec)["qpos"])
+    lane = next(k for k, record in enumerate(spec.lanes) if record.ground_truth == "yes")  # it begins elsewhere
+    window = Timetable(((0, 41), (49, 50)))
+    assert np.flatnonzero(window.away(50) == 1).tolist() == [44, 45]
+    assert tracked(world, lane, window) == ("yes", "yes", "yes", "no")  # at 10, 5, 2 and 1 frames a second
+    assert tracked(world, lane, Timetable(((0, 42), (49, 50)))) == ("yes", "no", "yes", "no")  # 45 alone

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -121,6 +122,15 @@ def test_twenty_three_models_that_lie_well_apart_are_all_told_apart(rows):
     assert not table.loc[table["figure"] == "j", "separable"].any()  # J is 1 of all of them
     board = leaderboard(metrics, intervals(resampled), table)
     assert (board["rank_low"] == board["rank_high"]).all()
+
+
+def test_reference_rows_are_ranked_among_themselves(rows):
+    named = (("oracle", 200), ("a", 100), ("always-abstain", 0))
+    metrics, resampled, table = scored(*(rows(pairs_with(200, acc, 0, 200), model=m) for m, acc in named))
+    board = leaderboard(metrics, intervals(resampled), table).set_index("model")
+    assert board["rank"].to_dict() == {"oracle": 1, "always-abstain": 2, "a": 1}
+    assert board.loc["a", ["rank_low", "rank_high"]].tolist() == [1, 1]
+    assert board.loc["always-abstain", ["rank_low", "rank_high"]].tolist() == [2, 2]
 
 
 def test_equal_models_are_not_separable_and_share_all_ranks(rows):
@@ -377,4 +387,12 @@ def test_the_command_compares_what_both_benchmarks_still_hold(rows, tmp_path, ca
     assert written["n_pairs"].tolist() == [3, 3]
     assert written["difference"].tolist() == [0, 0]
     assert {"n_missing_now", "epoch_then", "benchmark_version_now", "refused"} <= set(written.columns)
-    assert "occlusion" in capsys.readouterr().out
+    assert "occlusion" not in capsys.readouterr().out  # nothing differs
+    then_rows = rows([(True, False, True), (True, False, False), (True, False, True)])
+    Workspace.open(Path(then)).tables.write(VERDICTS, cell.partition, then_rows, {})
+    assert main(["results", "compare", then, "--workspace", now]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    # AbsRec was 2/3 with Acc 1 and FalseAbs 0, and is 1 now
+    pecs, j = (line.split() for line in lines if line.startswith("occlusion"))
+    assert pecs[:5] == ["occlusion", "pecs", "0.667", "1.000", "+0.333"] and j[1:5] == ["j", *pecs[2:5]]
+    assert max(map(len, lines)) <= 100

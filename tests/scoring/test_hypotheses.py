@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pandas as pd
 import pytest
 
-from traps_pipeline.protocol.datasets import ARMS, DATASETS, GRADED, UNPAIRED, VARIATIONS, sides_of
+from traps_pipeline.protocol.datasets import ARMS, DATASETS, GRADED, TWO_EVENTS, UNPAIRED, VARIATIONS, sides_of
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.hypothesis_tables import hypotheses as printed
 from traps_pipeline.scoring.doses import DATASETS_READ, HYPOTHESES, hypotheses, wrong_rows
@@ -33,7 +33,7 @@ def test_every_variation_is_a_dose_of_one_hypothesis_and_none_is_an_arm():
     doses = [name for one in HYPOTHESES for dose in one.doses for name in dose.datasets]
     assert {*VARIATIONS} == {*doses} - {*DATASETS} - {*ARMS}
     assert all(doses.count(name) == 1 for name in VARIATIONS)
-    assert set(UNPAIRED) == {*ARMS, *VARIATIONS, GRADED} and not {*ARMS} & {*VARIATIONS}
+    assert set(UNPAIRED) == {*ARMS, *VARIATIONS, GRADED, TWO_EVENTS} and not {*ARMS} & {*VARIATIONS}
 
 
 def test_a_dose_is_compared_with_its_reference_on_the_scenarios_that_both_have(rows: Rows):

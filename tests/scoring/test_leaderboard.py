@@ -142,6 +142,19 @@ def test_an_entry_is_incomplete_below_99_percent_answered(lost, incomplete, rows
     assert (row.answered, row.incomplete) == (1 - lost / 100, incomplete)
 
 
+def test_an_entry_that_answered_every_item_of_a_held_out_set_is_complete(rows):
+    verdicts = rows([(True, False, True)] * 4).iloc[[0, 3, 4, 7]]  # one side of each pair
+    row = entry(board_of(verdicts))
+    assert (row.n_pairs, row.n_missing, row.answered, row.incomplete, row.pecs, row["rank"]) == (
+        4,
+        0,
+        1.0,
+        False,
+        1.0,
+        1,
+    )
+
+
 def test_an_item_without_a_majority_is_answered_all_the_same(rows):
     row = entry(board_of(rows([(None, False, True)])))
     assert (row.n_missing, row.answered, row.incomplete) == (1, 1.0, False)

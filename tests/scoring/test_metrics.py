@@ -64,11 +64,19 @@ def test_undecided_items_leave_their_denominators_and_count_as_missing(rows):
     assert [cell.acc, cell.false_abs, cell.abs_rec] == pytest.approx([2 / 3, 1 / 3, 2 / 3])
 
 
-def test_a_verdict_that_was_never_written_counts_as_missing(rows):
-    verdicts = rows([(True, False, True), (True, False, True)]).iloc[:-1]
+def test_a_side_that_nobody_is_asked_is_not_missing(rows):
+    # As in a held-out set: controls of pairs 0 to 3, voids of pairs 4 to 7; one of each without a majority.
+    pairs = [(True, False, True), (True, False, True), (False, True, True), (None, None, True)]
+    pairs += [(True, False, True)] * 2 + [(True, False, False), (True, False, None)]
+    verdicts = rows(pairs).iloc[[0, 2, 4, 6, 9, 11, 13, 15]]
     cell = one(cell_metrics(verdicts), scope="all")
-    assert (cell.n_pairs, cell.n_missing, cell.abs_rec) == (2, 1, 1.0)
-    assert (cell.n_answered, cell.pecs_low, cell.pecs_high) == (3, 0.5, 1.0)
+    assert (cell.n_pairs, cell.n_missing, cell.n_answered) == (8, 2, 8)
+    assert cell.pecs == pytest.approx(2 / 3 * (2 / 3 - 1 / 3))
+    assert [cell.pecs_low, cell.pecs_high] == pytest.approx([0.0, 3 / 4 * (3 / 4 - 1 / 4)])  # worst: J = 1/2 - 2/4
+    whole = one(cell_metrics(verdicts.loc[verdicts["abstained"].notna()]), scope="all")
+    assert (whole.n_missing, whole.pecs_low, whole.pecs_high) == (0, whole.pecs, whole.pecs)
+    alone = one(cell_metrics(verdicts.loc[verdicts["side"].eq("void")]), scope="all")
+    assert (alone.n_acc, alone.n_missing, alone.pecs_low, alone.pecs_high) == (0, 1, 0.0, 3 / 4)
 
 
 def test_bounds_of_a_cell_with_three_of_a_hundred_items_missing(rows):

@@ -10,6 +10,7 @@ from tools.pocket.seeds import Figure
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.models.registry.checkpoint import as_folder, folder_digest
+from traps_pipeline.protocol.regimes import VQA_PROMPTS
 from traps_pipeline.storage.workspace import Workspace
 
 FACTS = "training.json"  # beside the folder of the weights
@@ -18,7 +19,7 @@ FACTS = "training.json"  # beside the folder of the weights
 def figures_of(workspace: Workspace) -> list[Figure]:
     """Return the figures of a finished workspace. Raises TrapsError if the seed of its weights is not known."""
     seed, weights = _seed_of(workspace, looked_into(workspace))
-    return [Figure(seed, weights, name, round(value, 6)) for name, value in claimed(workspace).items()]
+    return [Figure(seed, weights, *key, round(value, 6)) for key, value in claimed(workspace).items()]
 
 
 def looked_into(workspace: Workspace) -> str:
@@ -34,7 +35,8 @@ def looked_into(workspace: Workspace) -> str:
 
 def _seed_of(workspace: Workspace, model: str) -> tuple[int, str]:
     """Return training seed and digest of the weights whose states a workspace has."""
-    states = workspace.tables.read_all(HIDDEN_STATES, ["checkpoint", "checkpoint_digest"], model=model)
+    columns = ["checkpoint", "checkpoint_digest"]
+    states = workspace.tables.read_all(HIDDEN_STATES, columns, model=model, prompt=VQA_PROMPTS)
     checkpoints = sorted(set(zip(states["checkpoint"], states["checkpoint_digest"], strict=True)))
     if len(checkpoints) != 1:
         raise TrapsError(

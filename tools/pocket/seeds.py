@@ -26,11 +26,12 @@ class SeedRow:
 
 @dataclass(frozen=True)
 class Figure(SeedRow):
-    """What a claim of `claims.CLAIMS` comes to in the model of one training seed."""
+    """What a claim of the report comes to in the model of one training seed, or in one of its controls."""
 
     COMMAND = "card --mechanism"
     weights: str
     claim: str
+    subject: str
     value: float
 
 

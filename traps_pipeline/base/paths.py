@@ -33,6 +33,11 @@ def user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "traps"
 
 
+def user_state() -> Path:
+    """Return this user's folder of notes that must outlive any one study."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state").absolute() / "traps"
+
+
 def require_root() -> Path:
     """Return the folder of `assets/` and `scene_specs/`. Raises TrapsError if missing."""
     for folder in (ASSETS, SCENE_SPECS):

@@ -20,7 +20,7 @@ KINDS: Mapping[Group, str] = {"families": "scene family", "models": "backend of 
 
 @dataclass(frozen=True)
 class Plugin:
-    """What a package adds under a name. package: its distribution and version, which records and tables keep."""
+    """An object that an installed package adds under a name. package: its distribution and version."""
 
     group: Group
     name: str
@@ -63,8 +63,10 @@ def versioned(group: Group, name: str) -> str:
 
 
 def require_known(name: str, group: Group, own: Collection[str]) -> str:
-    """Return a backend's name. Raises ValueError unless it is one of this project's, or a package's."""
+    """Return a backend's name. Raises ValueError if it is unknown, TrapsError if a package has one of ours."""
     known = [*own, *plugins(group)]
+    if name in own and name in plugins(group):  # the package would stand in the keys of answers: all are asked again
+        raise plugins(group)[name].error("has the name of a backend of this project")
     if name not in known:
         raise ValueError(
             f"{name!r} is none; known: {', '.join(known)}{did_you_mean(name, known)}; a package adds one by an "

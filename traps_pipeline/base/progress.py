@@ -41,7 +41,10 @@ class Tally:
 
 @dataclass
 class Traffic:
-    """A stage's calls to one model or judge, with the last 500 latencies in seconds."""
+    """A stage's calls to one model or judge, with the last 500 latencies in seconds.
+
+    sent_at: when each call in flight was sent, the oldest first.
+    """
 
     wanted: int = 0
     cached: int = 0
@@ -51,6 +54,12 @@ class Traffic:
     dollars: float = 0.0
     began: float = field(default_factory=lambda: time.monotonic())
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=500))
+    sent_at: dict[object, float] = field(default_factory=dict)
+
+    @property
+    def oldest_s(self) -> float:
+        """Age of the oldest call in flight, in seconds; 0 without one."""
+        return max((time.monotonic() - sent_at for sent_at in [*self.sent_at.values()]), default=0.0)
 
     @property
     def per_second(self) -> float:
@@ -65,7 +74,9 @@ class Traffic:
     def figures(self) -> dict[str, float]:
         """Return the figures by name, for a line of JSON."""
         counts = {name: getattr(self, name) for name in ("done", "wanted", "cached", "errors", "retries")}
-        pace = {"per_second": self.per_second, "p50_s": self.latency_s(0.5), "p95_s": self.latency_s(0.95)}
+        counts["in_flight"] = len(self.sent_at)
+        pace = {"oldest_s": self.oldest_s, "per_second": self.per_second}
+        pace |= {"p50_s": self.latency_s(0.5), "p95_s": self.latency_s(0.95)}
         return counts | {name: round(value, 3) for name, value in pace.items()} | {"usd": round(self.dollars, 6)}
 
 
@@ -97,7 +108,7 @@ class StageProgress:
     def left_s(self) -> float | None:
         """Seconds until the stage ends at its pace so far; None in its first seconds."""
         total = self.total()
-        begun_calls = max(self.done + self.share, self.cells * total.done / total.wanted if total.wanted else 0.0)
+        begun_calls = self.cells * total.done / total.wanted if total.wanted else self.done + self.share
         if not begun_calls or not self.partitions or self.seconds < PACE_S:
             return None
         return self.seconds / begun_calls * max(self.partitions - begun_calls, 0.0)
@@ -109,6 +120,8 @@ class StageProgress:
         total.latencies = deque(chain.from_iterable([*traffic.latencies] for traffic in tallies))
         for name in ("wanted", "cached", "done", "errors", "retries", "dollars"):
             setattr(total, name, sum(getattr(traffic, name) for traffic in tallies))
+        for traffic in tallies:
+            total.sent_at |= traffic.sent_at
         return total
 
     def work(self) -> list[str]:
@@ -124,6 +137,7 @@ class Progress:
         self.totals = dict[str, Tally]()
         self.current_stage: StageProgress | None = None
         self.spent_usd, self.budget_usd = 0.0, 0.0
+        self.is_stopping = False
         self._listeners = list[Callable[[str], None]]()
         self._heard_at = time.monotonic()
 
@@ -167,6 +181,20 @@ class Progress:
             traffic.wanted, traffic.cached = traffic.wanted + missing, traffic.cached + recorded_calls
         self.changed()
 
+    def expect(self, stage: str, calls: Mapping[str, tuple[int, int]], cells: float) -> None:
+        """Count the calls of all cells of a stage at once, as `asking` counts those of one."""
+        self.asking(stage, calls, cells)
+
+    @contextmanager
+    def in_flight(self, who: str) -> Iterator[None]:
+        """Count an attempt of a call as being in flight within the block."""
+        traffic, call = self._traffic(who) or Traffic(), object()
+        traffic.sent_at[call] = time.monotonic()
+        try:
+            yield
+        finally:
+            del traffic.sent_at[call]
+
     def called(self, who: str, failed: bool, latency_s: float, dollars: float) -> None:
         """Count a call that has finished, after its last retry."""
         self.spent_usd += dollars
@@ -192,10 +220,10 @@ class Progress:
             self.current_stage = None
             if stage.work():
                 for listener in self._listeners:
-                    listener(summary(stage))
+                    listener(self.summary(stage))
 
     def close(self) -> None:
-        """End the run."""
+        """End the run: report the stage that is open."""
         self.end_stage()
 
     def note(self, text: str) -> None:
@@ -213,7 +241,7 @@ class Progress:
 
     @contextmanager
     def heard_by(self, listener: Callable[[str], None]) -> Iterator[None]:
-        """Send a listener a progress line every 30 s and at a stage's end."""
+        """Call a listener with a progress line, every 30 s and at a stage's end."""
         self._listeners.append(listener)
         try:
             yield
@@ -234,16 +262,38 @@ class Progress:
         """Return the state on one line."""
         if (now := self.current_stage) is None:
             return "between two stages"
-        total, parts = now.total(), [f"{now.done:,} of {now.partitions:,}"] if now.partitions else []
+        if self.is_stopping:
+            return f"{now.name}: {self.waiting()}"
+        total, parts = now.total(), [f"{now.done:,} of {now.partitions:,} made"] if now.partitions else []
         if now.detail:
             parts.append(now.detail)
         if total.wanted:
-            parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"]
+            parts.append(f"{total.done:,} of {count_noun(total.wanted, 'call')}")
+            parts += [f"{len(total.sent_at):,} in flight (the oldest {clock(total.oldest_s)})"] if total.sent_at else []
+            parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"] if total.done else []
             parts += [count_noun(total.errors, "error")] if total.errors else []
             parts += [count_noun(total.retries, "retry", "retries")] if total.retries else []
             parts += [self.spent()] if self.budget_usd else []
         parts.append(f"{clock(now.seconds)} so far" if now.left_s is None else f"{clock(now.left_s)} left")
         return f"{now.name}: {', '.join(parts)}"
+
+    def waiting(self) -> str:
+        """Return which calls a run that was stopped waits for, in words."""
+        total = self.current_stage.total() if self.current_stage else Traffic()
+        if not total.sent_at:
+            return "stopping: no call is in flight"
+        calls = f"{count_noun(len(total.sent_at), 'call')} in flight, the oldest for {clock(total.oldest_s)}"
+        return f"stopping: waiting for {calls}"
+
+    def summary(self, stage: StageProgress) -> str:
+        """Return a stage's work on one line; of a run that was stopped, all calls, also of partitions not made."""
+        total = stage.total()
+        calls = f"{total.done:,} of {count_noun(total.wanted, 'call')}"
+        work = [calls] if self.is_stopping and total.wanted else stage.work()
+        retries = [f"{total.retries:,} retried"] if total.retries else []
+        dollars = [f"${total.dollars:,.2f}"] if total.dollars else []
+        made = f"{stage.done:,} of {stage.partitions:,} made"
+        return f"{stage.name}: {', '.join([made, *work, *retries, *dollars, clock(stage.seconds)])}"
 
     def spent(self) -> str:
         """Return the money spent and the budget, in words."""
@@ -251,15 +301,6 @@ class Progress:
 
     def _traffic(self, who: str) -> Traffic | None:
         return self.current_stage.calls.get(who) if self.current_stage else None
-
-
-def summary(stage: StageProgress) -> str:
-    """Return a stage's work on one line."""
-    total = stage.total()
-    retries = [f"{total.retries:,} retried"] if total.retries else []
-    dollars = [f"${total.dollars:,.2f}"] if total.dollars else []
-    parts = [f"{stage.done:,} of {stage.partitions:,} made", *stage.work(), *retries, *dollars, clock(stage.seconds)]
-    return f"{stage.name}: {', '.join(parts)}"
 
 
 def clock(seconds: float) -> str:
@@ -273,7 +314,7 @@ _current: list[Progress] = [Progress()]
 
 
 def current() -> Progress:
-    """Return the active progress."""
+    """Return the progress to which this process reports now."""
     return _current[-1]
 
 
@@ -283,6 +324,9 @@ def use_progress(progress: AnyProgress) -> Iterator[AnyProgress]:
     _current.append(progress)
     try:
         yield progress
+    except KeyboardInterrupt:
+        progress.is_stopping = True
+        raise
     finally:
         _current.pop()
         progress.close()

@@ -115,7 +115,7 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table with its title and notes before it is laid out; a JSON object holds it.
+    """A table with its title (one or more lines) and notes before it is laid out; a JSON object holds it.
 
     absence: is printed instead of rows, unless it is empty. left: the left-aligned columns, by index.
     """
@@ -131,4 +131,5 @@ class TextTable:
         """Return title, table and notes for standard output, like `text_table`."""
         table = wrap_text(plain(self.absence)) if self.absence else text_table(self.headings, self.rows, self.left)
         notes = [wrap_text(plain(note)) for note in self.notes]
-        return "\n".join([wrap_text(plain(self.title)), "", table, *([""] if notes else []), *notes]) + "\n"
+        title = [wrap_text(plain(line)) for line in self.title.splitlines()]
+        return "\n".join([*title, "", table, *([""] if notes else []), *notes]) + "\n"

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 
 def count_noun(count: int, singular: str, plural: str | None = None) -> str:
-    """Return a count with its noun: `1 family`, `2,340 scenarios`.
-
-    plural: the plural form; default: the singular with an s.
-    """
+    """Return a count with its noun: `1 family`, `2,340 scenarios`. plural: default, the singular with an s."""
     return f"{count:,} {singular if count == 1 else plural or f'{singular}s'}"
 
 

@@ -25,6 +25,7 @@ Model = TypeVar("Model", bound=BaseModel)
 MAX_YAML_BYTES, MAX_LINE_BYTES = 4 * 2**20, 4 * 2**20
 MAX_DEPTH, MAX_NODES, MAX_ALIASES = 40, 200_000, 200
 MAX_SAID = 300  # characters of a complaint
+_QUOTED = re.compile(r"'([\w./@-]{1,80})'")
 _TAG = "tag:yaml.org,2002:"
 _STRINGS = re.compile(r'"(?:[^"\\]|\\.)*"')
 _STEPS = {ord("["): 1, ord("{"): 1, ord("]"): -1, ord("}"): -1}
@@ -121,13 +122,45 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def name_file_in_errors(path: Path) -> Iterator[None]:
-    """Add the file's name to errors of the block that do not name it."""
+    """Add the file to errors of the block that do not name it, with the line of the first word that they quote."""
     try:
         yield
     except TrapsError as error:
-        if str(error).startswith(f"{path}: "):
+        text = str(error).removeprefix(f"{path}: ")
+        if text.startswith(f"{path}:"):
             raise
-        raise TrapsError(f"{path}: {error}") from error
+        word = _QUOTED.search(text)
+        raise TrapsError(f"{place_of(path, [], word[1] if word else '')}: {text}") from error
+
+
+def place_of(path: Path, keys: Sequence[int | str], word: str = "") -> str:
+    """Return `file:line` of the value below these keys, as far as they are there, or only the file.
+
+    word: the value of a scalar, or the name or `id` of a mapping, somewhere in the file; the keys begin there.
+    """
+    try:
+        nodes = {keys: (value, line) for keys, value, line in _nodes(yaml.compose(path.read_text("utf-8"), _SAFE))}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return str(path)
+    named = (place for place, (value, _) in nodes.items() if word in (value, *place[-1:]))
+    if (place := next(named, None) if word else () if nodes else None) is None:
+        return str(path)
+    place = place[:-1] if place[-1:] == ("id",) else place
+    for key in map(str, keys):
+        place = (*place, key) if (*place, key) in nodes else place
+    return f"{path}:{nodes[place][1]}"
+
+
+def _nodes(node: yaml.Node | None, *keys: str, line: int = 0) -> Iterator[tuple[tuple[str, ...], str, int]]:
+    """Yield keys, value (of a scalar) and line of a node and of all below it."""
+    if node is not None:
+        yield keys, node.value if isinstance(node, yaml.ScalarNode) else "", line or node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield from _nodes(value, *keys, str(key.value), line=key.start_mark.line + 1)
+    elif isinstance(node, yaml.SequenceNode):
+        for number, value in enumerate(node.value):
+            yield from _nodes(value, *keys, str(number))
 
 
 def _complaint(error: Exception) -> str:
@@ -200,15 +233,28 @@ def _depth(line: str) -> int:
 
 
 def parse_yaml_model(
-    model: type[Model], data: Any, path: Path, where: str = "", context: Mapping[str, Any] | None = None
+    model: type[Model],
+    data: Any,
+    path: Path,
+    where: str = "",
+    context: Mapping[str, Any] | None = None,
+    *,
+    entry: str = "",
+    also: Sequence[str] = (),
 ) -> Model:
-    """Validate parsed YAML. Raises TrapsError naming file, entry and field."""
+    """Validate parsed YAML. Raises TrapsError naming file, line, entry and field.
+
+    entry: the name or `id` of the mapping in the file, if it is not the whole; also: names of fields that are taken
+    off before.
+    """
     try:
         instance = model.model_validate(data, context=context)
     except ValidationError as error:
-        raise TrapsError(f"{path}{where and ': ' + where}: {explain(error, model)}") from error
+        place = place_of(path, error.errors()[0]["loc"], entry)
+        raise TrapsError(f"{place}{where and ': ' + where}: {explain(error, model, also)}") from error
     for field in _converted_values(data, instance):
-        raise TrapsError(f"{path}{where and ': ' + where}: {field}")
+        place = place_of(path, field.partition(":")[0].split("."), entry)
+        raise TrapsError(f"{place}{where and ': ' + where}: {field}")
     return instance
 
 
@@ -231,16 +277,53 @@ def _converted_values(data: Any, validated: Any, name: str = "") -> Iterator[str
         yield from _converted_values(raw, value, f"{name}.{key}" if name else str(key))
 
 
-def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Return a validation error as `field: complaint`, with the nearest known field."""
+def explain(error: ValidationError, model: type[BaseModel] | None = None, also: Sequence[str] = ()) -> str:
+    """Return a validation error as `field: complaint` in our words, with the nearest known field.
+
+    also: names of fields that the model does not have.
+    """
     parts = list[str]()
-    for error_details in error.errors():
-        field, message = ".".join(map(str, error_details["loc"])), error_details["msg"].removeprefix("Value error, ")
-        if error_details["type"] == "extra_forbidden":
-            field_names = [] if model is None else _fields_at(model, error_details["loc"][:-1])
-            message = f"there is no such key{did_you_mean(str(error_details['loc'][-1]), field_names)}"
+    for details in error.errors():
+        place, kind, value = details["loc"], details["type"], details.get("input")
+        place = place[1:] if place[:1] == ("own",) else place  # what a file has under other names
+        if kind == "value_error":
+            message = details["msg"].removeprefix("Value error, ")
+        elif kind == "extra_forbidden":
+            field_names = [] if model is None else [*_fields_at(model, place[:-1]), *also]
+            message = f"there is no such key{did_you_mean(str(place[-1]), field_names)}"
+        else:
+            message = _COMPLAINTS.get(
+                kind.removesuffix("_type").removesuffix("_parsing"), "must be of another kind, {given}"
+            )
+            given = "nothing stands there" if value in (None, {}) and kind != "missing" else f"not {value!r:.60}"
+            message = message.format(given=given, **details.get("ctx", {}))
+        field = ".".join(str(step) for step in place if step != "[key]")  # pydantic's word for a name itself
         parts.append(f"{field}: {message}" if field else message)
-    return plain("; ".join(parts))[:MAX_SAID]
+    return plain("; ".join(dict.fromkeys(parts)))[:MAX_SAID]
+
+
+# By kind of pydantic's error, whose own sentences name Python's types.
+_COMPLAINTS = {
+    "missing": "is missing; add it",
+    "json_invalid": "Invalid JSON: {error}",
+    **dict.fromkeys(("dict", "mapping", "model"), "must be a mapping, a line `key: value` for each, {given}"),
+    **dict.fromkeys(("list", "tuple"), "must be a list, as [a, b], {given}"),
+    "string": "must be a text, {given}; write it in quotes",
+    "bool": "must be true or false, {given}",
+    "float": "must be a number, {given}",
+    **dict.fromkeys(("int", "int_from_float"), "must be a whole number, {given}"),
+    "greater_than": "must be above {gt}, {given}",
+    "greater_than_equal": "must be at least {ge}, {given}",
+    "less_than": "must be below {lt}, {given}",
+    "less_than_equal": "must be at most {le}, {given}",
+    "too_short": "must have {min_length} or more; add some, or leave the key out",
+    "too_long": "must have {max_length} at most, {given}",
+    "string_too_short": "must have {min_length} characters or more, {given}",
+    "string_too_long": "must have {max_length} characters at most, {given}",
+    "string_pattern_mismatch": "must be of the form {pattern}, {given}",
+    **dict.fromkeys(("literal_error", "enum"), "must be one of {expected}, {given}"),
+    **dict.fromkeys(("date", "date_from_datetime"), "must be a date, as 2026-11-21, {given}"),
+}
 
 
 def _fields_at(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:

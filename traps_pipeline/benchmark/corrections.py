@@ -29,7 +29,7 @@ from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines, two_events_lines
-from traps_pipeline.protocol.datasets import ALL_CATEGORIES
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names, get_family
 from traps_pipeline.scenes.worlds.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.study import Study
@@ -42,7 +42,7 @@ LANE_WORDS = WORDS[:3]  # of scenarios of two events
 
 
 class Correction(BaseModel):
-    """One review decision."""
+    """A reviewer's decision about one scenario, as a line of a corrections file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     scenario_id: str = Field(pattern=Slug, max_length=80, description="family and number")
@@ -251,6 +251,10 @@ def _correct(where: str, prior: Scenario, correction: Correction) -> Scenario:
     if not changes:
         raise TrapsError(f"{where}: `correct` gives no change; give words, answer or params, or use `keep`")
     params = prior.params
+    if "params" in changes and prior.family == RECORDED:
+        raise TrapsError(
+            f"{where}: {prior.scenario_id}: recorded pairs have no parameters; change its line and import it again"
+        )
     if "params" in changes:
         base = params if params is not None else (prior.released.params if prior.released else {})
         unknown = sorted(set(changes["params"]) - set(base))
@@ -286,9 +290,14 @@ def load_scenarios(study: Study) -> dict[str, Scenario]:
     return subset(corrected_scenarios(), study)
 
 
+def current_benchmark() -> str:
+    """Return the name of the benchmark whose records are active."""
+    return "released" if SCENE_SPECS == OWN_SPECS else load_release().name
+
+
 def check_benchmark(study: Study) -> None:
     """Raise TrapsError unless the active records are of the study's benchmark."""
-    current = "released" if SCENE_SPECS == OWN_SPECS else load_release().name
+    current = current_benchmark()
     if study.benchmark != current:
         raise TrapsError(
             f"the benchmark of the study is {study.benchmark!r}, the records in {SCENE_SPECS} are {current!r}; "

@@ -11,18 +11,23 @@ import json
 import re
 import secrets
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
+from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
-from traps_pipeline.base.paths import OWN_SPECS, SCENE_SPECS
+from traps_pipeline.base.paths import OWN_SPECS, SCENE_SPECS, user_state
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.storage.benchmark_tables import ItemRow
 
 KEY_BYTES = 32
-MARKER = "held-out.json"  # the released items, in the study's folder and in that of a private benchmark
+MARKER = "held-out.json"  # the released items
+PUBLISHED = "published.txt"  # what of a private benchmark was published with its sides
+MIN_SEED, MIN_DIGITS = 2**48, 6  # of a seed that nobody guesses; different digits, and different steps between them
 Row = Mapping[str, Any]
 Asked = TypeVar("Asked", bound=ItemRow)
 
@@ -67,7 +72,12 @@ def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
 
 
 def _markers(study: Path) -> list[Path]:
-    return [study / MARKER, *([SCENE_SPECS / MARKER] if SCENE_SPECS != OWN_SPECS else [])]
+    # The user's folder is the one that copies of a study and of a private benchmark share.
+    return [study / MARKER, *([] if SCENE_SPECS == OWN_SPECS else [SCENE_SPECS / MARKER, _of_user(MARKER)])]
+
+
+def _of_user(name: str) -> Path:
+    return user_state() / f"{digest(load_release().canary)[:24]}.{name}"
 
 
 def held_out_items(study: Path) -> dict[str, str]:
@@ -88,8 +98,13 @@ def released_only(study: Path, rows: Iterable[Asked]) -> list[Asked]:
 def mark_held_out(study: Path, drawn: Iterable[Row]) -> None:
     """Note which items are held out; the study's folder is `study`.
 
-    Raises TrapsError if another item of one of these scenarios was released: both together would tell sides.
+    Raises TrapsError if another item of one of these scenarios was released, or all of them: together they tell sides.
     """
+    if SCENE_SPECS != OWN_SPECS and (note := _of_user(PUBLISHED)).is_file():
+        raise TrapsError(
+            f"{note}: {note.read_text()} of this benchmark was published, which tells sides; "
+            "draw another benchmark, or delete this file if nobody has seen what was published"
+        )
     items, former = {row["scenario_id"]: row["item_id"] for row in drawn}, held_out_items(study)
     again = sorted(scenario for scenario in items if former.get(scenario, items[scenario]) != items[scenario])
     if again:
@@ -102,24 +117,37 @@ def mark_held_out(study: Path, drawn: Iterable[Row]) -> None:
 
 
 def require_secret_seed(benchmark: Path) -> None:
-    """Raise TrapsError if a benchmark's name or canary, which are published, hold the seed that draws its records."""
+    """Raise TrapsError if a benchmark's seed, which draws its records, can be guessed or is in its name or canary."""
     from traps_pipeline.scenes.draw.sample import load_tallies
 
     release = load_release(benchmark / "benchmark.yaml")
-    public = f"{release.name} {release.canary.partition(':CANARY:')[0]}"
-    seeds = {tally.seed for tally in load_tallies(benchmark / "released").values()}
-    if seeds & {int(number) for number in re.findall(r"\d{1,19}", public)}:
-        raise TrapsError(
-            f"{benchmark / 'benchmark.yaml'}: its name holds the seed, by which anyone can draw the records again; "
-            "draw a new benchmark with another seed, and name it by `--name`"
-        )
+    public = re.sub(r"\W", "", f"{release.name} {release.canary.partition(':CANARY:')[0]}").lower()
+    for seed in {tally.seed for tally in load_tallies(benchmark / "released").values()}:
+        steps = {(int(right) - int(left)) % 10 for left, right in pairwise(str(seed))}
+        is_named = str(seed) in public or f"{seed:x}" in public
+        if is_named or seed < MIN_SEED or min(len(steps), len({*str(seed)})) < MIN_DIGITS:
+            raise TrapsError(
+                f"{benchmark}: its seed can be guessed or stands in its name, so anyone can draw the records again; "
+                "draw a new benchmark with a seed of 60 random bits, and name it by `--name`"
+            )
 
 
-def refuse_held_out(study: Path, output: str) -> None:
-    """Raise TrapsError if items of a study are held out: the output would tell their sides."""
+def begin_publication(study: Path, output: str) -> None:
+    """Note that an output with sides is published; raise TrapsError if items of the study are held out."""
     for path in _markers(study):
         if path.is_file():
             raise TrapsError(
                 f"{path}: items of this study are held out, and {output} would tell their sides; publish it after the "
                 "evaluation, when you delete this file"
             )
+    if SCENE_SPECS != OWN_SPECS:
+        with suppress(TrapsError):  # a home that cannot be written stops no open publication
+            write_text(_of_user(PUBLISHED), output)
+
+
+def count_scoring(key: Path, answers: Path) -> int:
+    """Note a file of answers beside the key by which it was scored; return how many files were."""
+    note = key.with_name(f"{key.name}.scored")
+    digests = {file_digest(answers), *(note.read_text().split() if note.is_file() else ())}
+    write_text(note, "\n".join(sorted(digests)) + "\n", private=True)
+    return len(digests)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -67,11 +68,11 @@ def balance(rows: pd.DataFrame) -> pd.DataFrame:
 
 def telling_numbers(specs: Iterable[TwoEventsSpec]) -> list[str]:
     """Return a sentence for each number in view that tells hidden lanes from seen ones, over all or in a family."""
-    rows = lane_numbers(specs)
-    whole = rows.groupby("family")["side"].transform("size") >= len(SIDES) * FAMILY_LANES
+    lanes = Counter((rows := lane_numbers(specs))["family"])
+    whole = rows.loc[[lanes[family] >= len(SIDES) * FAMILY_LANES for family in rows["family"]]]
     found = [(number, value, LARGEST_AUC, "") for number, value in balance(rows)[["number", "auc"]].to_numpy()]
-    if whole.any():
-        worst = balance(rows[whole])[["number", "family_auc", "family"]].to_numpy()
+    if len(whole):
+        worst = balance(whole)[["number", "family_auc", "family"]].to_numpy()
         found += [(number, value, LARGEST_FAMILY_AUC, f" of {family}") for number, value, family in worst]
     return [
         f"two events: {number} tells hidden lanes{family} from seen ones (AUC {value:.2f}, {1 - limit:g} to {limit:g} "

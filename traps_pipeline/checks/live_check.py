@@ -1,15 +1,16 @@
 """Check models and judges with live calls before money is spent.
 
 `traps models check --live` and the preflight of a run do. Each model is asked about a clip that is red and then blue,
-once with the clip and once without, and in its JSON form; each judge votes on answers with known votes. Every problem
-is a sentence that names the cause and the remedy.
+once with the clip and once without, and in its JSON form if a run may ask for it; each judge votes on answers with
+known votes. Every problem is a sentence that names the cause and the remedy.
 """
 
 from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -27,6 +28,7 @@ from traps_pipeline.models.asking.ask import Call, SettledCell, collect
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.asking.participants import Row
 from traps_pipeline.models.money.budget import check_money
+from traps_pipeline.models.money.forecast import remember_latencies
 from traps_pipeline.models.reading.interpret import degenerate, read_answer
 from traps_pipeline.models.reading.thinking import declaration_line, split_thinking, undeclared_mark
 from traps_pipeline.models.registry.accounts import Account
@@ -89,8 +91,11 @@ def _studio() -> SyntheticClip:
     return SyntheticClip([halves[2 * k // _FRAMES] for k in range(_FRAMES)], _FPS)
 
 
-def requests_of(entry: Entry) -> dict[str, Request]:
-    """Return an entry's test calls by name, stamped with the time so none is reused."""
+def requests_of(entry: Entry, *, structured: bool = True) -> dict[str, Request]:
+    """Return an entry's test calls by name, stamped with the time so none is reused.
+
+    structured: whether a model is asked for an object of a schema, too.
+    """
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -104,7 +109,7 @@ def requests_of(entry: Entry) -> dict[str, Request]:
     assert isinstance(entry, ModelEntry)
     clip_media = _studio().prepare(entry.media) if entry.media else None
     forms = {"clip": ("standard", clip_media), "no clip": ("standard", None)}
-    if entry.json_schema:
+    if entry.json_schema and structured:
         forms["schema"] = ("json", clip_media)
     return {
         name: question(entry, regime, QUESTION, media, {"check": name, "at": now})
@@ -265,8 +270,11 @@ def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: li
 # --- asking -----------------------------------------------------------------------------------------------------------
 
 
-def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
-    """Ask these entries in parallel, without a study; their cost is not recorded."""
+def check_live(entries: Iterable[Entry], unstructured: Collection[str] = ()) -> list[LiveResult]:
+    """Ask these entries in parallel, without a study; their cost is not recorded, but how long an answer takes.
+
+    unstructured: ids of models whose runs ask for no object of a schema.
+    """
 
     async def every() -> list[LiveResult]:
         return list(await asyncio.gather(*(one(entry) for entry in entries)))
@@ -276,26 +284,33 @@ def check_live(entries: Iterable[Entry]) -> list[LiveResult]:
         server_check = await asyncio.to_thread(check_server, entry, account)
         if server_check.problem:
             return LiveResult(entry, [server_check.problem])
-        backend = make_backend(entry)
+        backend, began, seconds = make_backend(entry), time.monotonic(), list[float]()
 
         async def asked(request: Request) -> Outcome:
             try:
                 async with asyncio.timeout(TIMEOUT_S):
-                    return await backend.ask(request)
+                    outcome = await backend.ask(request)
+                    seconds.append(time.monotonic() - began)
+                    return outcome
             except TransientError as error:
                 return replace(error.outcome, error=error.why if error.kind == MALFORMED else error.kind)
             except TimeoutError:
-                return Outcome("error", error="timeout")
+                seconds.append(TIMEOUT_S)  # at least
+                return Outcome("error", error=_LATE)
 
-        requests = requests_of(entry)
+        requests = requests_of(entry, structured=entry.id not in unstructured)
         outcomes = await asyncio.gather(*map(asked, requests.values()))
+        if seconds:
+            remember_latencies(entry, account.base_url, seconds)
         return findings(entry, account, dict(zip(requests, outcomes, strict=True)), server_check)
 
     return asyncio.run(every())
 
 
-def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry]) -> list[LiveResult]:
-    """Check prices, then ask the models and judges of a run, under its budget.
+def preflight(
+    workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry], *, structured: bool
+) -> list[LiveResult]:
+    """Check prices, then ask the models and judges of a run, under its budget; structured: see `requests_of`.
 
     The calls are in the ledger of votes. Raises TrapsError if the study does not allow a participant's cost: judges are
     checked before a model is asked.
@@ -312,7 +327,7 @@ def preflight(workspace: Workspace, models: Sequence[Entry], judges: Sequence[En
         for entry in entries
         if not server_checks[entry.id].problem
     }
-    requests = {name: requests_of(entry) for name, entry in quick_entries.items()}
+    requests = {name: requests_of(entry, structured=structured) for name, entry in quick_entries.items()}
     calls = [Call(request) for entry_requests in requests.values() for request in entry_requests.values()]
     outcomes: Mapping[str, Outcome] = {}
     if calls:

@@ -77,10 +77,7 @@ def _serve(answers: Iterator[tuple[int, bytes]] | None = None) -> Iterator[tuple
 
 
 def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[int, bytes]]) -> list[Outcome]:
-    """Return each request's outcome when the provider sends the given answer.
-
-    answers: status and JSON.
-    """
+    """Return each request's outcome when the provider sends the given answer. answers: status and JSON."""
     account = load_accounts()[str(entry.account)]
     with _serve(iter(answers)) as (address, _), use_progress(_Notes()):
         loopback = _Loopback(base_url=address + urlsplit(account.base_url or "").path)

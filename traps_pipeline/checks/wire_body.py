@@ -38,7 +38,7 @@ class WireBody:
 
     @cached_property
     def body(self) -> dict[str, Any]:
-        """The parsed JSON."""
+        """The sent JSON, parsed."""
         return json.loads(self.raw)
 
     @property

@@ -49,7 +49,7 @@ GROUPS = {
 START = """TRAPSBench: do vision-language models know when not to answer?
 
   traps doctor                  check this machine
-  traps run demo                evaluate reference models; needs no key
+  traps run demo                evaluate reference strategies; needs no key
   traps plan mine.yaml          count calls and dollars; nothing is sent
   traps status                  say what is not fresh, and how to mend it
   traps why ITEM                show an item with its answers and votes

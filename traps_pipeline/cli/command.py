@@ -124,10 +124,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class Commands:
-    """The commands of a parser, some of them in groups.
-
-    by_name: their parsers.
-    """
+    """The commands of a parser, some of them in groups. by_name: their parsers."""
 
     def __init__(self, parser: Parser, groups: Mapping[str, str] | None = None) -> None:
         title = "groups" if groups else "commands"
@@ -267,13 +264,20 @@ def enter_workspace(workspace: Workspace) -> Workspace:
 
     os.environ[VARIABLE] = str(workspace.place)
     clear_caches()  # the workspace may define models
-    os.environ.setdefault("DAGSTER_HOME", str(workspace.dagster_home))
+    os.environ["DAGSTER_HOME"] = os.environ.get("DAGSTER_HOME") or str(
+        workspace.dagster_home
+    )  # `DAGSTER_HOME=` is none
     return workspace
 
 
 def load_definitions() -> None:
     """Declare the pipeline's graph, for staleness, without importing Dagster."""
     import traps_pipeline.pipeline.stages  # noqa: F401 - its import is what declares the graph
+
+
+def ledger_faults(workspace: Workspace) -> list[str]:
+    """Return what is wrong with the ledger's database and its money, before a run refuses to write on it."""
+    return [*workspace.ledger.faults()] if workspace.ledger.exists() else []
 
 
 def add_experiment(parser: argparse.ArgumentParser, **settings: Any) -> None:
@@ -288,7 +292,7 @@ def add_panel(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--judged-by-rules",
         action="store_true",
-        help="let the panel `rules` judge more than reference models; every table and page then says so",
+        help="let the panel `rules` judge more than reference strategies; every table and page then says so",
     )
 
 

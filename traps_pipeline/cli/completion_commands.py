@@ -24,7 +24,7 @@ USE = {"bash": 'eval "$(traps completion bash)"', "zsh": 'eval "$(traps completi
 
 
 def add(commands: Commands) -> None:
-    """Add `traps completion`."""
+    """Add `traps completion` to the parser."""
     text = "print a script that lets a shell complete commands, options and experiments"
     parser = commands.add("completion", completion, text, example="bash", workspace=False)
     parser.add_argument("shell", choices=tuple(USE))

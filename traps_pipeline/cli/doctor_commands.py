@@ -11,7 +11,7 @@ from traps_pipeline.cli.command import FAILED, OK, Commands, place_of, print_jso
 
 
 def add(commands: Commands) -> None:
-    """Add `traps doctor`."""
+    """Add `traps doctor` to the parser."""
     text = "check this machine: render and encode a frame, and name what is missing"
     parser = commands.add("study doctor", doctor, text, example="--verify", json=True)
     parser.add_argument(

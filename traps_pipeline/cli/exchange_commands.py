@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,12 +67,15 @@ def export_calls(arguments: argparse.Namespace) -> int:
 
 
 def import_given(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.benchmark.held_out import held_out_key
+    from traps_pipeline.benchmark.held_out import count_scoring, held_out_key
     from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 
     experiment = experiment_of(arguments)
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
     import_result = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
+    if arguments.key:
+        count = count_noun(count_scoring(arguments.key, arguments.file), "file")
+        print(f"scored by this key: {count}; about 20 scores of one participant tell every side", file=sys.stderr)
     return _print_import(import_result, arguments, "answer")
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
-    """Add `traps init`."""
+    """Add `traps init` to the parser."""
     text = "make a workspace for an experiment without running it"
     parser = commands.add("study init", init, text, example="demo --workspace .workspaces/demo")
     add_experiment(parser, nargs="?", default="demo")

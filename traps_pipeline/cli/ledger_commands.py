@@ -11,7 +11,7 @@ from traps_pipeline.cli.command import OK, Commands, open_workspace, print_json
 
 
 def add(commands: Commands) -> None:
-    """Add the ledger commands."""
+    """Add the commands that export, import and move a ledger to the parser."""
     text = "write answers, votes and money to one file, as they are"
     parser = commands.add("study export-ledger", export, text, example="ledger.sqlite")
     parser.add_argument("file", type=Path, metavar="FILE", help="the file to write")

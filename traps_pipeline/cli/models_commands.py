@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Collection, Sequence
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
@@ -35,9 +36,9 @@ def check(arguments: argparse.Namespace) -> int:
 
     names = _chosen_names(arguments)
     if arguments.live:
-        return _check_live(names, is_json=arguments.json)
+        return _check_live([*names], {name for name, structured in names.items() if not structured}, arguments)
     if arguments.json:
-        checks = [*check_named(names)]
+        checks = [*check_named([*names])]
         print_json(
             [
                 {"id": entry_check.entry.id, "sent": entry_check.line, "problems": entry_check.problems}
@@ -46,7 +47,7 @@ def check(arguments: argparse.Namespace) -> int:
         )
         return FAILED if any(entry_check.problems for entry_check in checks) else OK
     n_problems = 0
-    for result in check_named(names):
+    for result in check_named([*names]):
         print("\n    ".join([result.line, *result.problems]), flush=True)
         n_problems += bool(result.problems)
     print(
@@ -57,8 +58,8 @@ def check(arguments: argparse.Namespace) -> int:
     return FAILED if n_problems else OK
 
 
-def _chosen_names(arguments: argparse.Namespace) -> list[str]:
-    """Return ids of named models and judges, and those of panels and experiments.
+def _chosen_names(arguments: argparse.Namespace) -> dict[str, bool]:
+    """Return ids of named models and judges, and of panels and experiments; whether one may be asked for JSON.
 
     The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
     """
@@ -69,21 +70,22 @@ def _chosen_names(arguments: argparse.Namespace) -> list[str]:
     place = place_of(arguments)
     if Workspace.is_there(place):
         enter_workspace(Workspace.open(place))
-    names, panels = list[str](), {name: [judge.id for judge in load_panel(name)] for name in load_panels()}
+    names, panels = dict[str, bool](), {name: [judge.id for judge in load_panel(name)] for name in load_panels()}
     for name in arguments.names:
         if name in panels:
-            names += panels[name]
+            names |= dict.fromkeys(panels[name], True)
             continue
         if not name.endswith((".yaml", ".yml")):
-            names.append(name)
+            names[name] = True
             continue
         experiment = load_experiment(name)
         judges = load_panel(experiment.panel) if experiment.panel else ()
-        names += [*experiment.models, *(judge.id for judge in judges)]
+        for each in (*experiment.models, *(judge.id for judge in judges)):
+            names[each] = names.get(each, False) or experiment.is_structured
     return names
 
 
-def _check_live(names: list[str], *, is_json: bool) -> int:
+def _check_live(names: Sequence[str], unstructured: Collection[str], arguments: argparse.Namespace) -> int:
     from traps_pipeline.checks.live_check import check_live
     from traps_pipeline.checks.wire_check import participants
     from traps_pipeline.models.registry.entries import NETWORK
@@ -94,10 +96,10 @@ def _check_live(names: list[str], *, is_json: bool) -> int:
     entries = [entry_of[name] for name in names if entry_of[name].backend == NETWORK]
     if not entries:
         raise TrapsError("--live asks over the network: name a model or judge with an address, or an experiment")
-    checks = check_live(entries)
-    if is_json:
+    checks = check_live(entries, unstructured)
+    if arguments.json:
         print_json(checks)
-    for entry_check in () if is_json else checks:
+    for entry_check in () if arguments.json else checks:
         print(entry_check.line, flush=True)
     return FAILED if any(entry_check.problems or entry_check.unchecked for entry_check in checks) else OK
 

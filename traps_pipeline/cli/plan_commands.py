@@ -8,7 +8,7 @@ from math import comb
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.terminal import text_table, wrap_text
+from traps_pipeline.base.terminal import plain, text_table, wrap_text
 from traps_pipeline.base.wording import count_noun, in_percent
 from traps_pipeline.cli.command import (
     OK,
@@ -16,11 +16,13 @@ from traps_pipeline.cli.command import (
     add_experiment,
     add_panel,
     experiment_of,
+    ledger_faults,
     load_definitions,
     open_workspace,
     place_of,
     print_json,
 )
+from traps_pipeline.protocol.datasets import taxonomy_of
 
 if TYPE_CHECKING:
     from traps_pipeline.mechanism.cost import Cost
@@ -28,8 +30,8 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
-    """Add `traps plan`."""
-    text = "count the calls of an experiment, with their price and the precision of its figures; nothing is sent"
+    """Add `traps plan` to the parser."""
+    text = "count the calls of an experiment, with their price and the precision of PECS; nothing is sent"
     parser = commands.add("study plan", plan, text, example="demo", json=True)
     add_experiment(parser)
     parser.add_argument(
@@ -57,11 +59,14 @@ def plan(arguments: argparse.Namespace) -> int:
     # An experiment that the study does not hold in this form wants other partitions, which a run would add.
     is_held = workspace is not None and workspace.study.experiments.get(experiment.name) == experiment.asked
     stages = [status for status in run_plan.statuses() if status.to_make] if run_plan and is_held else []
+    faults = ledger_faults(workspace) if workspace else []
     if arguments.json:
-        head = {"experiment": experiment.name, "workspace": str(place) if workspace else None}
+        head = {"experiment": experiment.name, "workspace": str(place) if workspace else None, "ledger": faults}
         print_json(head | {"plan": plan_counts, "stages": stages})
         return OK
     total = (Count(), Count())
+    for fault in faults:
+        print(wrap_text(plain(fault)))
     location = place if workspace else "a new workspace"
     print(wrap_text(f"{experiment.name} in {location}: calls wanted, known (in the ledger), new"))
     rows = {**plan_counts.calls, **{f"{model}, steered": counts for model, counts in plan_counts.steered.items()}}
@@ -87,7 +92,7 @@ def plan(arguments: argparse.Namespace) -> int:
     if plan_counts.uncertain:
         text = (
             f"This is an upper bound: items of {', '.join(plan_counts.uncertain)} are still to be made, so all of "
-            "their calls are counted as new. Materialize scene_specs, videos and items for exact counts."
+            "their calls are counted as new. `traps run EXPERIMENT --until items` makes them, for exact counts."
         )
         print(wrap_text(text))
     return OK
@@ -104,10 +109,24 @@ def _print_precision(pairs: Mapping[str, int], models: int) -> None:
             f"FalseAbs {false_abs} (PECS {example.pecs:.2f}) gets a 95 % interval of PECS about {expected.width:.3f} "
             f"wide; {_power(expected.difference, 'two models with unrelated answers')}"
         )
+        if (balanced := _balanced(pairs, models)) and balanced[1] < (expected.difference or 2.0):
+            text += f"; as many scenarios, but {balanced[0]} of each taxonomy, find one of {balanced[1]:.3f}"
         if models > 2:
             all_models = f"two of {models} models, after Holm's correction over their {comb(models, 2)} comparisons"
             text += f"\n{_power(expected.among_all, all_models)}"
         print(wrap_text(text))
+
+
+def _balanced(pairs: Mapping[str, int], models: int) -> tuple[int, float] | None:
+    """Return scenarios of each taxonomy and what they detect, if one has less than half of the other's."""
+    from traps_pipeline.scoring.power import precision
+
+    sizes = {taxonomy_of(name): count for name, count in pairs.items() if count}
+    if len(sizes) != 2 or 2 * min(sizes.values()) > max(sizes.values()):
+        return None
+    half = sum(sizes.values()) // 2
+    difference = precision({name: half for name, count in pairs.items() if count}, models=models).difference
+    return None if difference is None else (half, difference)
 
 
 def _power(least: float | None, models: str) -> str:
@@ -135,6 +154,10 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
     headings = ("over the network", "calls", "tokens (M)", "USD low", "expected", "high", "minutes")
     print(f"\n{text_table(headings, rows)}")
     print("tokens: millions read, written; minutes of all: models, then judges")
+    for row in forecasts:
+        if row.queued_minutes >= 1 and row.queued_minutes > 2 * row.minutes:
+            duration = f"{row.queued_minutes:,.0f} minutes"
+            print(wrap_text(f"{row.participant}: {duration} instead, if its server takes one call at a time"))
     batch_usd = sum(row.dollars[1] * row.batch_price for row in forecasts if row.dollars is not None)
     if batch_usd < total[1]:
         heading = "expected if all calls are made in batches (traps study export-requests --batch)"
@@ -145,7 +168,10 @@ def _print_forecasts(forecasts: Sequence[Forecast], minutes: float) -> None:
 
 
 def _print_local(costs: Sequence[Cost], card: str) -> None:
-    """Print passes, tokens, GPU-hours and memory; sums omit models without a size."""
+    """Print passes, tokens, GPU-hours, memory, and what does not fit; sums omit models without a size."""
+    from traps_pipeline.mechanism.cost import CARDS, too_large
+    from traps_pipeline.models.registry.entries import get_model
+
     rows = [
         (
             cost.model, cost.kind, f"{cost.passes:,}", f"{cost.tokens_in / 1e6:,.2f}, {cost.tokens_out / 1e6:,.2f}",
@@ -157,6 +183,9 @@ def _print_local(costs: Sequence[Cost], card: str) -> None:
     rows.append(("all", "", f"{sum(cost.passes for cost in costs):,}", "", f"{hours:,.1f}", ""))
     print(f"\n{text_table(('on this machine', 'work', 'new', 'M tokens in, out', f'{card} hours', 'GB'), rows)}")
     print("hours and GB are arithmetic, checked on one card: docs/mechanism.md#cost")
+    quantised = {c.model for c in costs if get_model(c.model).inside_params().quantisation == "nf4"}
+    for sentence in too_large(costs, CARDS[card], quantised):
+        print(wrap_text(sentence))
 
 
 def _dollars(amounts: tuple[float, float, float] | None) -> list[str]:

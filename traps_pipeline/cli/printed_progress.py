@@ -8,13 +8,14 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from typing_extensions import override
 
-from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, clock, summary
+from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, clock
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 Form = Literal["auto", "plain", "json"]
 MAX_ROWS = 12  # models and judges in the live region
-_OF_CALLS = 58  # columns of the live table beside the name
+_OF_CALLS, _WIDE = 64, 100  # columns of the live table beside the name; of a terminal that shows the pace, too
 
 
 def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedProgress:
@@ -62,16 +63,23 @@ class PrintedProgress(Progress):
         super().end_stage()
         if stage is None or not stage.partitions:
             return
-        if stage.work() or stage.seconds >= HEARTBEAT_S:
-            self.write(summary(stage))
+        if stage.work() or stage.seconds >= HEARTBEAT_S or (self.is_stopping and stage.calls):
+            self.write(self.summary(stage))
         else:
             self._tables, self._tables_s = self._tables + stage.done - stage.empty, self._tables_s + stage.seconds
+
+    @override
+    def expect(self, stage: str, calls: Mapping[str, tuple[int, int]], cells: float) -> None:
+        super().expect(stage, calls, cells)
+        if any(missing for missing, _ in calls.values()):
+            with self._printing:
+                self.beat()
 
     @override
     def close(self) -> None:
         super().close()
         self._closed.set()
-        if self._tables:
+        if self._tables and not self.is_stopping:
             tables = count_noun(self._tables, "table or figure", "tables and figures")
             self.write(f"{tables}, {self._tables_s:.0f} s")
             self._tables, self._tables_s = 0, 0.0
@@ -192,7 +200,7 @@ class LiveProgress(PrintedProgress):
         super().close()
 
     def beat(self) -> None:
-        """Draw the region."""
+        """Draw the live region of the terminal again."""
         self._live.refresh()
 
     @override
@@ -206,14 +214,17 @@ class LiveProgress(PrintedProgress):
         from rich.text import Text
 
         if (now := self.current_stage) is None:
-            return Group(Text(f"{self._idle}  {clock(time.monotonic() - self._idle_since)}", style="dim"))
+            idle = "stopping" if self.is_stopping else self._idle
+            return Group(Text(f"{idle}  {clock(time.monotonic() - self._idle_since)}", style="dim"))
         lines: list[Any] = [Text(self._heading(now), style="bold", no_wrap=True, overflow="ellipsis")]
-        if now.detail:
+        if now.detail and not self.is_stopping:
             lines.append(Text(plain(f"  {now.detail}"), no_wrap=True, overflow="ellipsis"))
         return Group(*lines, *([self._calls(now)] if now.calls else []))
 
     def _heading(self, now: StageProgress) -> str:
         """Return the stage, partitions, times and money, within 80 columns."""
+        if self.is_stopping:
+            return f"{now.name}  {self.waiting()}"
         counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
         time_left = "" if now.left_s is None else f", {clock(now.left_s)} left"
         money = f"  {self.spent()}" if self.budget_usd and now.calls else ""
@@ -225,18 +236,20 @@ class LiveProgress(PrintedProgress):
 
         table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
         table.add_column("")
-        for heading in ("done", "calls", "p50", "p95", "errors", "retries", "spent"):
+        width = self._console.width
+        pace_heading = ("pace",) if width >= _WIDE else ()
+        for heading in ("done", "in flight", *pace_heading, "p50", "p95", "errors", "retries", "spent"):
             table.add_column(heading, justify="right", no_wrap=True)
         rows = sorted(now.calls.items(), key=lambda pair: pair[1].done >= pair[1].wanted)
         max_rows = max(1, min(MAX_ROWS, self._console.height - 6))
         for participant, traffic in rows[:max_rows]:
             name = Text(plain(participant), no_wrap=True)
-            name.truncate(max(10, self._console.width - _OF_CALLS), overflow="ellipsis")
-            calls, pace = f"{traffic.done:,}/{traffic.wanted:,}", f"{traffic.per_second:.1f}/s"
-            latencies = [f"{traffic.latency_s(share):.1f} s" for share in (0.5, 0.95)]
-            table.add_row(
-                name, calls, pace, *latencies, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}"
-            )
+            name.truncate(max(10, width - _OF_CALLS), overflow="ellipsis")
+            in_flight = f"{len(traffic.sent_at):,}, {traffic.oldest_s:.0f} s" if traffic.sent_at else "-"
+            cells = [f"{traffic.done:,}/{traffic.wanted:,}", in_flight]
+            cells += [f"{traffic.per_second:.1f}/s"] if pace_heading else []
+            cells += [f"{traffic.latency_s(share):.1f} s" if traffic.done else "-" for share in (0.5, 0.95)]
+            table.add_row(name, *cells, f"{traffic.errors:,}", f"{traffic.retries:,}", f"${traffic.dollars:,.2f}")
         if len(rows) > max_rows:
             table.add_row(f"and {len(rows) - max_rows} more")
         return table

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from traps_pipeline.base.sheets import csv_bytes
-from traps_pipeline.base.terminal import text_table, wrap_text
+from traps_pipeline.base.terminal import plain, text_table, wrap_text
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import OK, Commands, open_workspace, place_of, print_json
 
@@ -24,9 +26,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("--all", action="store_true", help="also show the statements that agree")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
 
-    text = "write every table, figure and page to a folder"
-    parser = commands.add("results export", export_results, text, example="results")
-    parser.add_argument("folder", nargs="?", type=Path, help="default: `export` in the study's folder")
+    text = "write every table, figure and page to a folder, or to one file"
+    parser = commands.add("results export", export_results, text, example="results.zip")
+    parser.add_argument("folder", nargs="?", type=Path, help="or a file .zip; default: `export` in the study's folder")
 
     text = "print this study minus another on their common pairs, with paired intervals"
     parser = commands.add("results compare", compare_studies, text, example=".workspaces/earlier", json=True)
@@ -58,7 +60,7 @@ def _megabytes(size: int) -> str:
 
 
 def audit_published(arguments: argparse.Namespace) -> int:
-    """Discrepancies are findings, not failures."""
+    """Print what the paper's tables contradict; a discrepancy is a finding and fails nothing."""
     from traps_pipeline.scoring.audit import audit, audit_text
 
     findings = audit()
@@ -78,7 +80,8 @@ def export_results(arguments: argparse.Namespace) -> int:
     workspace = open_workspace(arguments)
     target = (arguments.folder or workspace.root / "export").absolute()
     count = export(workspace, target, say=lambda line: print(line, flush=True))
-    print(f"{count_noun(count, 'file')} in {target}\nnext: open {target / INDEX}")
+    advice = f"unpack it and open {INDEX}" if target.suffix == ".zip" else f"open {target / INDEX}"
+    print(f"{count_noun(count, 'file')} in {target}\nnext: {advice}")
     return OK
 
 
@@ -96,16 +99,36 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(table)
         return OK
-    words = {True: "yes", False: "no"}
-    separable = [words.get(value, "too few") for value in table["separable"]]
-    separable = ["-" if p != p else word for word, p in zip(separable, table["p"], strict=True)]
-    contrasts = table.assign(separable=separable, refused=table["refused"].fillna(""))
-    print(text_table(list(contrasts), [[_cell(value) for value in row] for row in contrasts.itertuples(index=False)]))
+    rows = table.to_dict("records")
+    changed = [row for row in rows if row["refused"] is None and _differs(row)]
+    entries = dict.fromkeys((row["model"], row["regime"]) for row in changed)
+    for model, regime in entries:
+        cells = [_change(row) for row in changed if (row["model"], row["regime"]) == (model, regime)]
+        headings = ("dataset", "figure", "then", "now", "change", "95 % interval", "separable", "missing")
+        print(f"{plain(model)}, {regime}\n{text_table(headings, cells, left=(0, 1))}\n")
+    for reason in dict.fromkeys(row["refused"] for row in rows if row["refused"]):
+        print(wrap_text(f"not compared: {plain(reason)}"))
+    pairs = {(row["model"], row["regime"], row["dataset"]): row["n_pairs"] for row in rows}
+    n_pairs = sum(count for (*_, dataset), count in pairs.items() if dataset != "overall")
+    differ = f"{len(changed)} of {count_noun(len(rows), 'figure')} differ on {count_noun(n_pairs, 'common pair')}"
+    print(wrap_text(f"{differ}; --csv FILE and --json have all"))
     return OK
 
 
-def _cell(value: object) -> str:
-    """Return a figure with four digits, or a dash if it is missing."""
-    if not isinstance(value, float):
-        return str(value)
-    return "-" if value != value else f"{value:.4f}"
+def _differs(row: Mapping[Any, Any]) -> bool:
+    """Return whether a figure or the number of missing answers is another one now."""
+    pairs = [(row[f"{name}then"], row[f"{name}now"]) for name in ("", "n_missing_")]
+    return any(then != now and not (then != then and now != now) for then, now in pairs)
+
+
+def _change(row: Mapping[Any, Any]) -> list[str]:
+    """Return a row of the printed table."""
+
+    def figure(name: str, sign: str = "") -> str:
+        return "-" if row[name] != row[name] else f"{row[name]:{sign}.3f}"
+
+    interval = "-" if row["ci_low"] != row["ci_low"] else f"[{figure('ci_low', '+')}, {figure('ci_high', '+')}]"
+    separable = "-" if row["p"] != row["p"] else {True: "yes", False: "no"}.get(row["separable"], "too few")
+    missing = [int(row[f"n_missing_{side}"]) for side in ("then", "now")]
+    figures = [figure("then"), figure("now"), figure("difference", "+"), interval]
+    return [row["dataset"], row["figure"], *figures, separable, "" if not any(missing) else "{} -> {}".format(*missing)]

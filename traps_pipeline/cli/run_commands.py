@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.base.errors import TrapsError
@@ -25,6 +27,7 @@ from traps_pipeline.cli.command import (
     integer,
     load_definitions,
     number,
+    place_of,
     print_failure,
     print_json,
 )
@@ -42,7 +45,7 @@ MONEY = ("budget_usd", "model_budgets_usd", "allow_unknown_prices")  # fields of
 
 
 def add(commands: Commands) -> None:
-    """Add `traps run`."""
+    """Add `traps run` to the parser."""
     text = "make every missing or stale partition of an experiment, and print the leaderboard"
     parser = commands.add("study run", run, text, example="demo --until leaderboard", is_paid=True, json=True)
     add_experiment(parser)
@@ -103,7 +106,15 @@ def run(arguments: argparse.Namespace) -> int:
     from traps_pipeline.cli.printed_progress import make_progress
 
     experiment = experiment_of(arguments)
+    if arguments.cluster:
+        from traps_pipeline.storage.several_hosts import several_hosts
+
+        several_hosts()  # refuses before a workspace is made
+    place = place_of(arguments)
+    is_new = isinstance(place, Path) and not place.exists()
     workspace = create(arguments, experiment, money=_money(experiment, arguments))
+    if arguments.until is not None:
+        _require_stages(arguments.until, workspace, is_new=is_new)
     stream = sys.stderr if arguments.json else sys.stdout
     title = f"{experiment.name}: {experiment.description}" if experiment.description else experiment.name
     print(f"{wrap_text(title, stream)}\nworkspace {workspace.place}", file=stream, flush=True)
@@ -148,6 +159,22 @@ def run(arguments: argparse.Namespace) -> int:
         command = shlex.join(["traps", "run", arguments.experiment, *workspace_option])
         print(wrap_text(f"next: `{command}` for the stages after {arguments.until}"))
     return OK
+
+
+def _require_stages(until: str, workspace: Workspace, *, is_new: bool) -> None:
+    """Raise TrapsError for unknown stages, and take away a workspace that this command has just made.
+
+    The stages are declared with the keys of its study, so that it must be there before they are known.
+    """
+    load_definitions()
+    from traps_pipeline.pipeline.run_plan import stages_until
+
+    try:
+        stages_until(until)
+    except TrapsError:
+        if is_new:
+            shutil.rmtree(workspace.root)
+        raise
 
 
 def _goes_on(arguments: argparse.Namespace, unchecked: str) -> bool:

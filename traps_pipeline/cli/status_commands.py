@@ -6,6 +6,7 @@ import argparse
 import os
 import shlex
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base.errors import TrapsError
@@ -17,6 +18,7 @@ from traps_pipeline.cli.command import (
     Commands,
     add_experiment,
     experiment_of,
+    ledger_faults,
     load_definitions,
     open_workspace,
     print_json,
@@ -53,14 +55,17 @@ def status(arguments: argparse.Namespace) -> int:
 
     load_definitions()
     rows = [*RunPlan(workspace, experiment).statuses()]
-    checks = [*failing_checks(workspace)]
+    checks, faults = [*failing_checks(workspace)], ledger_faults(workspace)
     command = _command(workspace, arguments, environment)
     if arguments.json:
         names = ("check", "stage", "partition", "reason")
         failing = [dict(zip(names, check, strict=True)) for check in checks]
-        print_json({"workspace": str(workspace.place), "command": command, "checks": failing, "stages": rows})
+        head = {"workspace": str(workspace.place), "command": command, "ledger": faults}
+        print_json(head | {"checks": failing, "stages": rows})
         return OK
     print(f"workspace {workspace.place}")
+    for fault in faults:
+        print(wrap_text(plain(fault)))
     for check, stage, partition, reason in checks:
         print(wrap_text(plain(f"check {check} of {stage} {partition} does not pass: {reason}")))
     total, rows_to_make = sum(row.fresh for row in rows), [row for row in rows if row.to_make]
@@ -84,24 +89,30 @@ def status(arguments: argparse.Namespace) -> int:
 def _command(workspace: Workspace, arguments: argparse.Namespace, exported: Mapping[str, str]) -> str:
     """Return a command that refreshes stale partitions, in the shell with these variables.
 
-    It runs the given experiment or the study's only one; for several, or one whose file is not known, it is the job of
-    the whole study, which needs no file.
+    It runs the given experiment, or each of the study's; for one whose file is neither in the current folder nor
+    among those of the package, it is the job of the whole study, which needs no file.
     """
-    from traps_pipeline.pipeline.experiment import EXPERIMENTS
     from traps_pipeline.storage.workspace import VARIABLE
 
     experiments = [arguments.experiment] if arguments.experiment else [*workspace.study.experiments]
-    files = [
-        name for name in experiments if name.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{name}.yaml").exists()
-    ]
-    if len(files) == len(experiments) == 1:
+    files = [*filter(None, map(_file_of, experiments))]
+    if files and len(files) == len(experiments):
         workspace_option = [] if arguments.workspace is None else ["--workspace", str(workspace.place)]
-        return shlex.join(["traps", "run", files[0], *workspace_option])
+        return " && ".join(shlex.join(["traps", "run", file, *workspace_option]) for file in files)
     required_variables = {VARIABLE: str(workspace.place), "DAGSTER_HOME": os.environ["DAGSTER_HOME"]}
     assignments = [
         f"{name}={shlex.quote(value)}" for name, value in required_variables.items() if exported.get(name) != value
     ]
     return " ".join([*assignments, "dagster job execute -m traps_pipeline.definitions -j everything"])
+
+
+def _file_of(experiment: str) -> str:
+    """Return what `traps run` takes for an experiment, by its name or path; empty if its file is not known."""
+    from traps_pipeline.pipeline.experiment import EXPERIMENTS
+
+    if experiment.endswith((".yaml", ".yml")) or (EXPERIMENTS / f"{experiment}.yaml").exists():
+        return experiment
+    return f"{experiment}.yaml" if Path(f"{experiment}.yaml").is_file() else ""
 
 
 def why(arguments: argparse.Namespace) -> int:

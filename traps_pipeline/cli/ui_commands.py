@@ -14,7 +14,7 @@ _OWN_S = 5.0  # time for the second process itself, after its children have ende
 
 
 def add(commands: Commands) -> None:
-    """Add `traps ui`."""
+    """Add `traps ui` to the parser."""
     text = "start Dagster's web server and daemon; print the address to open, with its token"
     parser = commands.add("study ui", ui, text, example="--port 3001")
     parser.add_argument("--port", type=integer(1, 65535), default=3000, help="port of the web server (default: 3000)")

@@ -200,6 +200,11 @@ class AnswerContext:
     run: int = 1
     key: bytes | None = None
 
+    def name_of(self, request: Request) -> str:
+        """Return an item's name as the file has it: a message about a held-out set may go to its participant."""
+        item = str(request.about["item_id"])
+        return opaque(self.key, item) if self.key else item
+
 
 def import_answers(
     workspace: Workspace,
@@ -222,17 +227,22 @@ def import_answers(
     requests_by_key = {request.key: request for request in requests}
     if path.suffix != LOG and is_batch(path):
         return _import_batch(workspace, workspace.answers, load_models(), requests_by_key, path)
-    reader = reader_of(path)
+    reader, context = reader_of(path), context or AnswerContext()
     answers, n_failed = (
         (checked_answers(path, requests_by_key), 0)
         if reader is None
-        else _answers_by_item(reader(path), requests_by_key, context or AnswerContext())
+        else _answers_by_item(reader(path), requests_by_key, context)
     )
     if not answers:
         raise TrapsError(f"{path}: holds no answers; nothing was imported")
     like_errors = [key for key, answer in answers.items() if _ERROR_TEXT.match((answer.text or "")[:MAX_LOOKED_AT])]
     if like_errors and errors is None:
-        raise TrapsError(_error_warning(path, {key: answers[key] for key in like_errors}, requests_by_key))
+        texts = [(context.name_of(requests_by_key[key]), plain(answers[key].text)[:60]) for key in like_errors]
+        raise TrapsError(
+            f"{path}: {count_noun(len(texts), 'text')} may be an error message, not an answer "
+            f"({'; '.join(f'{item}: {text!r}' for item, text in texts[:MAX_LINES])}): say --errors drop to leave them "
+            "missing, or --errors keep if they are answers; nothing was imported"
+        )
     for key in like_errors if errors == "drop" else ():
         del answers[key]
     outcomes = [
@@ -242,17 +252,6 @@ def import_answers(
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
     failed = f"{count_noun(n_failed, 'sample')} of the log" if n_failed else ""
     return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
-
-
-def _error_warning(path: Path, answers: Mapping[str, Answer], requested: Mapping[str, Request]) -> str:
-    """Return a message about texts that look like errors, with number and examples."""
-    examples = [f"{requested[key].about['item_id']}: {plain(answer.text)[:60]!r}" for key, answer in answers.items()][
-        :MAX_LINES
-    ]
-    return (
-        f"{path}: {count_noun(len(answers), 'text')} may be an error message, not an answer ({'; '.join(examples)}): "
-        "say --errors drop to leave them missing, or --errors keep if they are answers; nothing was imported"
-    )
 
 
 def export_request_batches(

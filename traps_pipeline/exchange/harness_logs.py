@@ -87,8 +87,8 @@ def _eval_log(path: Path) -> Iterator[LoggedAnswer]:
     try:
         with reading_archive(), zipfile.ZipFile(path) as archive, path.open("rb") as raw:
             entries = [entry for entry in archive.infolist() if entry.filename.startswith("samples/")]
-            if len(entries) > MAX_SAMPLES:
-                raise TrapsError(f"{path}: has more than {MAX_SAMPLES} samples")
+            if len(entries) > MAX_SAMPLES or sum(entry.file_size for entry in entries) > MAX_LOG_BYTES:
+                raise TrapsError(f"{path}: has more than {MAX_SAMPLES} samples, or {MAX_LOG_BYTES} bytes of them")
             for entry in entries:
                 if entry.file_size > MAX_SAMPLE_BYTES:
                     raise TrapsError(f"{path}: {entry.filename} has {entry.file_size} bytes; log without images")

@@ -101,7 +101,7 @@ class AgreementRow:
     fleiss_kappa: Annotated[float | None, "panel, over n_complete; null for two judges"]
     cohen_kappa: Annotated[float | None, "two judges, over n_complete; null for the panel"]
     alpha: Annotated[float | None, "Krippendorff's alpha (nominal), an invalid vote being a missing one"]
-    undefined: Annotated[str | None, "why a figure that these judges should have is null"]
+    undefined: Annotated[str | None, "why a statistic that these judges should have is null"]
     epoch: VoteEpochs
     benchmark_version: shared.BenchmarkVersion
 

@@ -209,10 +209,7 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
 
 
 def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | None = None, asked: str = "") -> Vote:
-    """Return the vote in a row of the ledger.
-
-    Thinking, asked: see `parse_judgement`.
-    """
+    """Return the vote in a row of the ledger. Thinking, asked: see `parse_judgement`."""
     if row["outcome"] in WITH_TEXT and row["text"] == UNREAD:
         return Vote(False, invalid_reason=UNREAD)
     vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row, thinking, asked)

@@ -45,7 +45,7 @@ class PlainAnswer(BaseModel):
     correct: bool
 
     def expected(self, task: Task) -> bool:
-        """Return the right vote."""
+        """Return the vote that is right for this answer."""
         return self.abstained if task == "abstention" else self.correct
 
 

@@ -1,4 +1,4 @@
-"""Judge by rules: read texts of reference models exactly, and no other text.
+"""Judge by rules: read texts of reference strategies exactly, and no other text.
 
 Like any judge it reads the rendered user message and answers with the JSON that the prompts ask for, or with the word
 `unread`. It never guesses; docs/judging.md, "The rule judge" lists the forms that it reads.

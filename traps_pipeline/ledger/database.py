@@ -100,10 +100,7 @@ class Database(ABC):
 
     @abstractmethod
     def run(self, work: Callable[[sa.Connection], T]) -> T:
-        """Run `work` in one transaction, repeated if the connection breaks.
-
-        Raises TrapsError.
-        """
+        """Run `work` in one transaction, repeated if the connection breaks. Raises TrapsError."""
 
     def run_once(self, work: Callable[[sa.Connection], T]) -> T:
         """Run `work` as `run` does, but not again if only its commit's answer was lost."""
@@ -140,7 +137,7 @@ class Database(ABC):
     @property
     @abstractmethod
     def put_aside(self) -> str:
-        """What a person does to go on in an empty database."""
+        """The command or step, in words, by which a person starts anew in an empty database."""
 
     def damaged(self, what: str) -> TrapsError:
         """Return the error of a ledger that must not be written on, with the way to save it."""

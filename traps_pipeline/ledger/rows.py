@@ -160,7 +160,7 @@ class Totals:
     means: dict[str, tuple[float, int]] = field(default_factory=dict)
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Count a row."""
+        """Count a row's cost, and its tokens in the means."""
         cost = row.get("cost_usd") or 0.0
         if not is_cost(cost):
             self.unknown += 1

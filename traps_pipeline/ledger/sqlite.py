@@ -75,7 +75,7 @@ class SqliteDatabase(Database):
 
     @override
     def salvage(self) -> sa.Connection:
-        """A file that is shorter than it says is otherwise refused as a whole."""
+        """Open the file for reading though it is shorter than it says, which SQLite refuses otherwise."""
 
         def open_cut() -> sqlite3.Connection:
             mode = "mode=ro" if self.path.with_name(f"{self.path.name}-wal").exists() else "immutable=1"
@@ -134,7 +134,7 @@ class SqliteDatabase(Database):
 
     @override
     def try_lock(self, name: str) -> Lock | None:
-        """The lock is a file's."""
+        """Take the lock of a file below `locks`, or return None if another process has it."""
         path = self.folder / "locks" / f"{name}.lock"
         try:
             descriptor = try_lock(path)

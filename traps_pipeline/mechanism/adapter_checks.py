@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -177,6 +178,43 @@ def _check_pooling(subject: Subject) -> str:
     return "equal"
 
 
+def _check_times(subject: Subject) -> str:
+    """Compare what a prompt says of time with the clip's, and with that of the clip at half the speed."""
+    model, step = subject.model, float(np.diff(subject.times_s).mean())
+    prompt = subject.prompts[1]
+    slow = model.prompt(SYSTEM, QUESTIONS[1], subject.frames, 2 * subject.times_s)
+    scales = [name for name, value in prompt.inputs.items() if value.is_floating_point() and value.numel() == 1]
+    for name in scales:
+        seconds, of_slow = (float(inputs[name]) for inputs in (prompt.inputs, slow.inputs))
+        frames = seconds / step  # of one step of positions: as many as the tower merges
+        _require(
+            abs(frames - round(frames)) < 0.02 * frames and abs(of_slow - 2 * seconds) < 0.02 * of_slow,
+            f"{name} is {seconds:.3g} s, but frames are {step:.3g} s apart",
+        )
+    if scales:
+        return f"{', '.join(scales)} is the frames' own"
+    ids = prompt.inputs["input_ids"], slow.inputs["input_ids"]
+    if ids[0].shape == ids[1].shape and bool((ids[0] == ids[1]).all()):
+        return "it is told no times"
+    return f"written in the prompt, to {_require_stamps(subject, slow):.1g} s"
+
+
+def _require_stamps(subject: Subject, slow: Prompt) -> float:
+    """Return how far written times are from those of the frames that they stand for, at half the speed."""
+    parts = spans(subject.model, slow, SYSTEM, QUESTIONS[1])
+    ids, places = slow.inputs["input_ids"][0], np.flatnonzero(parts["stamps"])
+    runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)  # a stamp each, between pictures
+    text = " ".join(subject.model.processor.tokenizer.decode(ids[run]) for run in runs)
+    written = [60 * float(minutes or 0) + float(s) for minutes, s in re.findall(r"(?:(\d+):)?(\d+(?:\.\d+)?)", text)]
+    times = 2 * subject.times_s
+    merged = len(times) // max(1, len(written))
+    means = times[: merged * len(written)].reshape(len(written), -1).mean(axis=1) if written and merged else times
+    _require(len(means) == len(written), f"its prompt has {len(written)} times for {len(times)} frames ({text[:60]!r})")
+    error = float(np.abs(means - written).max())
+    _require(error <= 1, f"its prompt says {written} s, but the frames are at {means.tolist()} s")
+    return error
+
+
 # --- patching ---------------------------------------------------------------------------------------------------------
 
 
@@ -226,6 +264,10 @@ def _clips(subject: Subject) -> str:
 
 def _batches(subject: Subject) -> str:
     model, prompts = subject.model, subject.prompts
+    again, push = [prompts[0], *prompts, prompts[0]], subject.steered(0.5, -0.5, 0.5, 0.5, 0.5)  # equal prompts share
+    steered = model.generate(again, NEW_TOKENS, steering=push)
+    alone = [model.generate([prompt], NEW_TOKENS, steering=push.rows([n]))[0] for n, prompt in enumerate(again)]
+    _require([a.tokens for a in steered] == [a.tokens for a in alone], "a steered answer depends on its batch")
     with _end_at(model, model.generate(prompts[:1], 2)[0].tokens[-1]):
         batched_answers = model.generate(prompts, NEW_TOKENS)
         single_answers = [model.generate([prompt], NEW_TOKENS)[0] for prompt in prompts]
@@ -253,10 +295,11 @@ CHECKS = (
         "alpha", "a steered state is the plain one and alpha times v, and none below it changes", _check_steered_states
     ),
     Check("parts", "system prompt, question and visual tokens are where their texts are", _parts, exact=False),
+    Check("times", "a prompt says of the clip's times what is so, or nothing", _check_times, exact=False),
     Check("means", "the mean over the question's tokens is that of the library's states", _check_pooling),
     Check("patching", "a patch with itself changes nothing, one of all positions gives the source", _check_patching),
     Check("clips", "the vision tower sees a clip once, and states stay as they are", _clips),
-    Check("batches", "answers do not depend on their batch, nor on rows that end early", _batches),
+    Check("batches", "answers, steered or not, do not depend on their batch, nor on rows that end early", _batches),
 )
 
 

@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.mechanism.control_rows import ProbeBaselineRow
+from traps_pipeline.mechanism.control_rows import LOGITS, ProbeBaselineRow
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
 from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun, Row
@@ -37,6 +37,7 @@ THUMBNAIL = (32, 24)  # pixels of a frame that a baseline sees, width and height
 NOISE_DRAWS = 10
 RAW = ("question words", "first frame", "all frames", "length", "time stamps")
 MARGIN, NOISE = "output margin", "noise"
+LIKELIEST = 256  # first tokens, the likeliest over all items, that a probe of the output reads
 Features = Mapping[str, np.ndarray]  # dataset -> (n, columns), rows in the order of the dataset's items
 
 
@@ -63,7 +64,9 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
         add(name, score_features(run, features))
     try:
-        add(MARGIN, score_features(run, output_margins(entry, states, [*items]), lambda states, void: IdentityScorer()))
+        output = output_features(entry, states, states, [*items])
+        add(MARGIN, score_features(run, output[MARGIN], lambda states, void: IdentityScorer()))
+        add(LOGITS, score_features(run, output[LOGITS]))
     except NoMargin as error:
         add(MARGIN, [_undefined_row()], str(error))
     add(NOISE, noise_floor(run, settings.seed))
@@ -74,7 +77,7 @@ class IdentityScorer:
     """A score without a fit: the only column of the features, larger for void."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
-        """Return the column, (n,)."""
+        """Return the only column of the features as scores, (n,)."""
         return states[:, 0]
 
 
@@ -115,7 +118,7 @@ def raw_features(
 
     questions = [question for rows in items.values() for question in rows["question"]]
     words = CountVectorizer(ngram_range=(1, 2), binary=True, token_pattern=r"(?u)\b\w+\b").fit(questions)
-    clips = {clip for rows in items.values() for name in ("clip", "times_clip") for clip in rows[name].dropna()}
+    clips = {clip for rows in items.values() for clip in rows["clip"]}
     clip_frames = {clip: _thumbnails(resolve(clip), spec) for clip in sorted(clips)}
     max_frames = max(len(frames) for frames, _, _ in clip_frames.values())
 
@@ -124,9 +127,9 @@ def raw_features(
         missing = np.repeat(frames.mean(axis=0, keepdims=True), max_frames - len(frames), axis=0)
         return np.concatenate([frames, missing]).ravel()
 
-    def stamps(row: Mapping[str, Any]) -> list[float]:
-        times = clip_frames[row["times_clip"] or row["clip"]][1]
-        return [len(clip_frames[row["clip"]][1]), times[0], times.mean(), times[-1]]
+    def stamps(clip: str) -> list[float]:
+        times = clip_frames[clip][1]
+        return [len(times), times[0], times.mean(), times[-1]]
 
     features: dict[str, dict[str, np.ndarray]] = {name: {} for name in RAW}
     for dataset, rows in items.items():
@@ -135,7 +138,7 @@ def raw_features(
         features["first frame"][dataset] = np.stack([clip_frames[row["clip"]][0][0].ravel() for row in shown_items])
         features["all frames"][dataset] = np.stack([pixels(row["clip"]) for row in shown_items])
         features["length"][dataset] = np.array([[clip_frames[row["clip"]][2]] for row in shown_items])
-        features["time stamps"][dataset] = np.array([stamps(row) for row in shown_items])
+        features["time stamps"][dataset] = np.array([stamps(row["clip"]) for row in shown_items])
     return dict(features)
 
 
@@ -168,25 +171,46 @@ def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, 
 
     if set(states.items["pooling"]) != {"last"}:
         raise NoMargin("states are means over tokens; set `pooling: last` to read the output margin")
-    model = load_local_model(entry, inside=True)
+    model = load_local_model(entry, inside=True, seed=states.extraction.weights_seed)
     try:
         return model, abstention_tokens(model)
     except TrapsError as error:
         raise NoMargin(str(error)) from error
 
 
-def output_margins(entry: ModelEntry, states: StoredStates, datasets: Sequence[str]) -> Features:
-    """Return every item's output margin under the extraction's prompt, (n, 1).
+def output_features(
+    entry: ModelEntry, states: StoredStates, order: StoredStates, datasets: Sequence[str]
+) -> dict[str, Features]:
+    """Return every item's output margin (n, 1), and log-probabilities of the LIKELIEST first tokens (n, k).
 
-    No pass is needed: the stored state after the final norm goes through the model's head. Raises NoMargin.
+    They are of the extraction's prompt, in the order of `order`'s items. No pass is needed: the stored state after the
+    final norm goes through the model's head. Raises NoMargin.
     """
-    from traps_pipeline.mechanism.margin import first_token_margins
+    import torch
+
+    from traps_pipeline.mechanism.margin import first_token_margins, head_logits
 
     model, tokens = margin_tokens(entry, states)
-    return {
-        name: first_token_margins(model, states.read(name, "normed"), tokens).double().numpy()[:, None]
-        for name in datasets
-    }
+    margins, chances = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    with torch.inference_mode():
+        for name in datasets:
+            normed = torch.from_numpy(states.read_as(order, name, "normed"))
+            margins[name] = first_token_margins(model, normed, tokens).double().numpy()[:, None]
+            chances[name] = head_logits(model, normed).log_softmax(-1).cpu().numpy()
+    means = np.mean([values.mean(axis=0) for values in chances.values()], axis=0)
+    likeliest = np.argsort(-means, kind="stable")[:LIKELIEST]
+    return {MARGIN: margins, LOGITS: {name: values[:, likeliest].astype(float) for name, values in chances.items()}}
+
+
+def output_or_note(
+    stage: str, entry: ModelEntry, states: StoredStates, order: StoredStates, datasets: Sequence[str]
+) -> dict[str, Features]:
+    """Return `output_features`; without a margin nothing, and a note in the progress of a stage."""
+    try:
+        return output_features(entry, states, order, datasets)
+    except NoMargin as error:
+        progress.current().note(f"{stage}: no output margin ({error})")
+        return {}
 
 
 # --- noise ------------------------------------------------------------------------------------------------------------

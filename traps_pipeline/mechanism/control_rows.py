@@ -11,8 +11,17 @@ Share = Annotated[float | None, "share, 0 to 1"]
 
 
 @dataclass(frozen=True, kw_only=True)
+class JoinedColumns(ExtractionColumns):
+    """Columns of rows that join a model's states with its answers."""
+
+    joins: Annotated[
+        str | None, "null: one model; else precision and frames of the two that are joined: no claim reads the row"
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
 class SteeringNullRow(SteeringColumns):
-    """A void direction's largest-dose effect on its dataset, ranked among nulls."""
+    """A void direction's effect on its dataset at one dose, ranked among nulls."""
 
     target: Annotated[str, "dataset of the direction, which is also the one that was steered; all: mean over datasets"]
     layer: Block
@@ -29,7 +38,11 @@ class SteeringNullRow(SteeringColumns):
     draws: Annotated[int, "draws of the null"]
     n_at_least: Annotated[int, "draws whose effect is at least that of the void direction"]
     p: Annotated[float, "(1 + n_at_least) / (1 + draws), one-sided"]
-    n: Annotated[int, "decided answers steered along the void direction, one per scenario and dataset"]
+    n: Annotated[int, "answers steered along the void direction, one per scenario and dataset"]
+    undecided: Annotated[float, "share of these that neither abstain nor answer"]
+    null_undecided: Annotated[float, "the same of the null"]
+    perplexity: Annotated[float | None, "of the answers under the unsteered model; null without one"]
+    null_perplexity: Annotated[float | None, "the same of the null"]
     epoch: shared.AnswerEpochs
 
 
@@ -57,6 +70,8 @@ class SteeringPecsRow(SteeringColumns):
     j: Annotated[float | None, "abs_rec - false_abs"]
     pecs: Share
     degenerate: Annotated[float, "share of answers that are cut off, repetitive, or in another script or language"]
+    undecided: Annotated[float, "share of answers that neither abstain nor answer; the other shares leave these out"]
+    perplexity: Annotated[float | None, "of the answers under the unsteered model, mean over sides; null without one"]
     n_controls: Annotated[int, "decided answers to controls"]
     n_voids: Annotated[int, "decided answers to voids"]
     epoch: shared.AnswerEpochs
@@ -99,7 +114,7 @@ PROBE_BASELINES = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateRow(ExtractionColumns):
+class GateRow(JoinedColumns):
     """Scores on a target before and after a gate, by features, source and threshold."""
 
     regime: Annotated[str, "system prompt of the answers that are gated"]
@@ -134,22 +149,6 @@ GATE = Table(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RiskCoverageRow(ExtractionColumns):
-    """A point of a risk-coverage curve, as a gate withholds the riskiest answers."""
-
-    regime: Annotated[str, "system prompt of the answers"]
-    features: Annotated[str, "as in gate; no gate: answers given up in no order, the risk of all"]
-    coverage: Annotated[float, "share of items that are answered"]
-    risk: Annotated[float, "share of these answers that are wrong; every answer to a void is"]
-    n: Annotated[int, "answers"]
-
-
-RISK_COVERAGE = Table(
-    "risk_coverage", RiskCoverageRow, partition_by=("model", "prompt"), key=("regime", "features", "coverage")
-)
-
-
-@dataclass(frozen=True, kw_only=True)
 class LensRow(ExtractionColumns):
     """The margin of a dataset's states at a layer (logit lens: final norm and head)."""
 
@@ -166,11 +165,43 @@ class LensRow(ExtractionColumns):
 
 LENS = Table("lens", LensRow, partition_by=("model", "prompt"), key=("dataset", "layer"))
 
+MODEL, STATES, RESIDUAL, LOGITS = "model", "states", "states, residual", "first-token logits"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeadRow(ExtractionColumns):
+    """How well features order a dataset's sides, by probes of the other datasets."""
+
+    subject: Annotated[
+        str,
+        "model; a control: random_0, random_1 (the network with random weights of that seed), or a placebo: answerable "
+        "items that stand for the target's voids, by their dataset",
+    ]
+    target: shared.Dataset
+    features: Annotated[
+        str,
+        "states; states, residual (without what is linear in words, pixels and length); or a rival: a raw input, "
+        "output margin or first-token logits (log-probabilities of 256 tokens, with a probe)",
+    ]
+    layer: Annotated[int, "of the states, chosen on pairs of other datasets than the target; -1 for rivals"]
+    auroc: Annotated[float, "voids against controls, by probes that have seen neither the dataset nor the scenario"]
+    low: Annotated[float, "95 % interval, scenarios resampled, probes held fixed"]
+    high: Annotated[float, "95 % interval, scenarios resampled, probes held fixed"]
+    rival: Annotated[str | None, "of states: the rival with the highest AUROC"]
+    lead: Annotated[float | None, "of states: their AUROC less that rival's"]
+    lead_low: Annotated[float | None, "95 % interval of the lead, both resampled together"]
+    lead_high: Annotated[float | None, "95 % interval of the lead, both resampled together"]
+    n_voids: Annotated[int, "items that stand for voids"]
+    n_controls: Annotated[int, "control items"]
+
+
+LEADS = Table("leads", LeadRow, partition_by=("model", "prompt"), key=("subject", "target", "features"))
+
 UNSEEN = "log-odds of void above the mid threshold, by a probe that has not seen the scenario"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ItemScoreRow(ExtractionColumns):
+class ItemScoreRow(JoinedColumns):
     """An item's scores from a model's states and output, beside its verdicts."""
 
     item_id: shared.ItemId
@@ -189,7 +220,7 @@ ITEM_SCORES = Table("item_scores", ItemScoreRow, partition_by=("model", "prompt"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SentenceRow(ExtractionColumns):
+class SentenceRow(JoinedColumns):
     """Log-probabilities of an abstention and of the model's answer, for an item."""
 
     item_id: shared.ItemId

@@ -6,13 +6,14 @@ token, and decoding steps are bound by each block's kernels or by reading the we
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from traps_pipeline.models.local.vision_cache import MAX_BYTES
 from traps_pipeline.models.registry.checkpoint import NF4_BYTES
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, SIDES, sides_of, taxonomy_of
+from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.media import MediaSpec
 from traps_pipeline.storage.study import MechanismSettings
 
@@ -24,24 +25,27 @@ ATTENTION_S = 14e-9  # beside it, per block, step, row and token of its prompt
 NF4_TIMES = 1.5  # factor on time, since weights are unpacked at every use
 BFLOAT16_BYTES = 2.0  # per parameter
 ROWS = 64  # rows of a batch of answers
+ROWS_BEHIND = 16  # texts behind one pass over a prompt, whose keys and values each of them repeats
 PEAK_WIDTHS = 28  # numbers per token and unit of width at a block's peak
 GRAPH = 22  # numbers per token, block and unit of width that a backward pass keeps
+RANDOM = "states of random weights"  # in bfloat16, whatever the entry says
 SOURCES = 4  # sources of patches: the other side, and three nulls
 
 
 @dataclass(frozen=True)
 class Card:
-    """A GPU's dense bfloat16 operations and memory bandwidth (bytes), per second."""
+    """A GPU's dense bfloat16 operations and memory bandwidth (bytes), per second; GB of memory."""
 
     operations: float
     bandwidth: float
+    gigabytes: float
 
 
 CARDS = {
-    "H100": Card(989e12, 3.35e12),
-    "A100": Card(312e12, 2.0e12),
-    "L40S": Card(362e12, 0.86e12),
-    "RTX4090": Card(165e12, 1.0e12),
+    "H100": Card(989e12, 3.35e12, 80),
+    "A100": Card(312e12, 2.0e12, 80),
+    "L40S": Card(362e12, 0.86e12, 48),
+    "RTX4090": Card(165e12, 1.0e12, 24),
 }
 
 
@@ -70,20 +74,42 @@ class Cost:
     gigabytes: float | None
 
 
-def mechanism_passes(settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int]) -> list[Work]:
+def too_large(costs: Sequence[Cost], card: Card, quantised: Collection[str]) -> list[str]:
+    """Return a sentence for each model and work that needs more memory than a card has: what to change.
+
+    quantised: the models that are looked into in NF4.
+    """
+    sentences = list[str]()
+    for cost in costs:
+        if cost.gigabytes is None or cost.gigabytes <= card.gigabytes:
+            continue
+        changes = {
+            "quantisation: nf4 under `mechanism` of its entry": cost.model not in quantised and cost.kind != RANDOM,
+            "random_weights: false there": cost.kind == RANDOM,
+            "patching: null": cost.kind == "patching",
+            "fewer frames (`media`)": True,
+        }
+        advice = " or ".join(change for change, helps in changes.items() if helps)
+        need = f"{cost.gigabytes:.1f} GB, but the card has {card.gigabytes:g}"
+        sentences.append(f"{cost.model}, {cost.kind}: does not fit: {need}; set {advice}")
+    return sentences
+
+
+def mechanism_passes(
+    settings: MechanismSettings, datasets: Sequence[str], scenarios: Mapping[str, int], random_weights: bool = True
+) -> list[Work]:
     """Return the forward passes of states, sentences, random weights and patching.
 
-    scenarios: their number by taxonomy.
+    scenarios: their number by taxonomy. random_weights: as in the model's entry.
     """
     n_pair_items = sum(2 * scenarios.get(taxonomy_of(name), 0) for name in datasets if name in DATASETS)
     extra_prompts = scenarios.get("occlusion", 0) * ("occlusion" in datasets)  # voids with a question that they answer
-    extra_prompts += 2 * scenarios.get("chaotic", 0) * ("chaotic" in datasets)  # sides with the other's times
     extra_prompts += sum(len(sides_of(arm)) * sum(scenarios.values()) for arm in datasets if arm in PROBED_ARMS)
     work = [Work("states", len(settings.prompts) * n_pair_items + extra_prompts)]
     if settings.sentences:  # under each regime; the sentences themselves are few tokens behind one pass
         work.append(Work("sentences", len(settings.prompts) * n_pair_items))
-    if settings.gate.untrained:
-        work.append(Work("states of random weights", n_pair_items + extra_prompts))
+    if random_weights:
+        work.append(Work(RANDOM, len(RANDOM_WEIGHTS) * (n_pair_items + extra_prompts)))
     if settings.patching is not None:
         pairs = sum(min(settings.patching.pairs, scenarios.get(name, 0)) for name in ("occlusion", "chaotic"))
         estimate = 2 + 3  # two recorded passes; one with gradients takes three times as long

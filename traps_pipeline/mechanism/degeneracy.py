@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections import Counter
 
@@ -12,15 +13,17 @@ MAX_PHRASE_WORDS = 8  # maximum words of a repeated phrase
 def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | None:
     """Return why a text is no answer, or None if it is one.
 
-    `truncated`: the limit of tokens cut it off (outcome). `repetition`: a phrase of one to eight words stands four
-    times in a row. `script`: most of its letters are of another script than those of the unsteered answer to the same
-    item. `empty`: the text is missing.
+    `truncated`: the limit of tokens cut it off (outcome). `empty`: the text is missing. `letters`: it has no letter and
+    no digit. `repetition`: a phrase of one to eight words stands four times in a row, or up to twelve characters six
+    times. `script`: most of its letters are of another script than those of the unsteered answer to the same item.
     """
     if outcome == "truncated":
         return outcome
     if not text:
         return "empty"
-    if repeats(text):
+    if not any(character.isalnum() for character in text):
+        return "letters"
+    if repeats(text) or re.search(r"(\S{1,12}?)\1{5}", text):
         return "repetition"
     unsteered_script, steered_script = script(unsteered or ""), script(text)
     return "script" if unsteered_script and steered_script and unsteered_script != steered_script else None

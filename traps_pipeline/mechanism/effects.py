@@ -119,18 +119,6 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
     return table.loc[has_several_layers].reset_index(drop=True)
 
 
-def own_effects(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return effects of each dataset's own direction and its nulls, signs by label.
-
-    They are at the layer with both sides. `gaps` holds the dose in units of the class gap; without a dose in that unit
-    there are no rows.
-    """
-    along = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
-    steered_layers = along.loc[along["side"] == "void", ["model", "layer"]].drop_duplicates()
-    along = in_gaps(along.merge(steered_layers, on=["model", "layer"]), along)
-    return along.loc[along["gaps"].notna()].reset_index(drop=True)
-
-
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
     """Return effects with `gaps`, their strength in class gaps of their own dataset.
 

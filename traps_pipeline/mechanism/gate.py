@@ -103,20 +103,11 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
     other scenarios. Its thresholds come from cross-validated scores of those same source items, so that they are scores
     of unseen items too; items with the same prompt count once. Raises TrapsError for a source without items.
     """
-    targets = items.table["dataset"].to_numpy(str)
-    target_rows = np.flatnonzero(targets == target)
-    is_source = np.isin(targets, sources_of_gate(source, target))
-    if not is_source.any():
-        raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
-    groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)
+    target_rows = np.flatnonzero(items.table["dataset"].to_numpy(str) == target)
     score = np.full(len(target_rows), np.nan)
     cut = {name: np.full(len(target_rows), NO_THRESHOLD) for name in THRESHOLDS}
     expected = {name: np.zeros(len(target_rows)) for name in THRESHOLDS}
-    for fold in _held_out_groups(groups[target_rows], source, folds, seed):
-        is_in_fold = np.isin(groups[target_rows], fold)
-        is_training = is_source & ~np.isin(groups, fold)
-        if len(set(items.void[is_training])) < 2:
-            continue
+    for is_in_fold, is_training in _each_fold(items, source, target, folds, seed):
         key = (is_training.tobytes(), folds, seed, false_abs)
         if key not in items.fitted:
             items.fitted[key] = fit_gate(items.rows(is_training), folds, seed, false_abs)
@@ -125,6 +116,32 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
         for name in THRESHOLDS:
             cut[name][is_in_fold], expected[name][is_in_fold] = cuts[name], shares[name]
     return Decisions(target_rows, score, cut, expected)
+
+
+def unseen_scores(items: Items, source: str, target: str, folds: int, seed: int) -> np.ndarray:
+    """Return the log-odds (n,) of a dataset's items by the probes of `decide`, without thresholds."""
+    target_features = items.features[items.table["dataset"].to_numpy(str) == target]
+    score = np.full(len(target_features), np.nan)
+    for is_in_fold, is_training in _each_fold(items, source, target, folds, seed):
+        probe = fit_probe(items.features[is_training], items.void[is_training])
+        score[is_in_fold] = probe.scores(target_features[is_in_fold])
+    return score
+
+
+def _each_fold(
+    items: Items, source: str, target: str, folds: int, seed: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield which of a target's items a gate decides, and which items it is fitted on."""
+    targets = items.table["dataset"].to_numpy(str)
+    is_source = np.isin(targets, sources_of_gate(source, target))
+    if not is_source.any():
+        raise TrapsError(f"a gate from {source} has no items; extract the hidden states of its datasets first")
+    groups = items.table["family" if source == OTHER_FAMILIES else "scenario_id"].to_numpy(str)
+    target_groups = groups[targets == target]
+    for fold in _held_out_groups(target_groups, source, folds, seed):
+        is_training = is_source & ~np.isin(groups, fold)
+        if len(set(items.void[is_training])) == 2:
+            yield np.isin(target_groups, fold), is_training
 
 
 def fit_gate(train: Items, folds: int, seed: int, false_abs: float) -> FittedGate:
@@ -191,25 +208,6 @@ class Outcomes:
         return np.stack([column for pair in zip(yes, is_decided, strict=True) for column in pair], axis=-1).astype(
             float
         )
-
-
-def risk_coverage(score: np.ndarray, outcomes: Outcomes, coverages: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Return (coverage, risk, answers kept) as the highest scores are withheld.
-
-    Answered items are those on which the model did not abstain. Coverage is the share of all items that are answered
-    and kept; risk is the share of kept answers that are wrong: every answer to a void, and every incorrect answer to a
-    control. Coverages above the share of answered items are left out.
-    """
-    is_answered = outcomes.abstained == 0
-    risk_of_item = np.where(outcomes.void, 1.0, 1 - outcomes.correct)
-    is_known = is_answered & np.isfinite(risk_of_item) & np.isfinite(score)
-    order = np.flatnonzero(is_known)[np.argsort(score[is_known], kind="stable")]
-    points = []
-    for coverage in coverages:
-        count = round(coverage * len(score))
-        if 0 < count <= len(order):
-            points.append((count / len(score), float(risk_of_item[order[:count]].mean()), count))
-    return points
 
 
 def separation(decisions: Decisions, void: np.ndarray) -> float:

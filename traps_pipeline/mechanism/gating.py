@@ -1,9 +1,9 @@
-"""Build GATE and RISK_COVERAGE rows (gate stage) from stored states and verdicts."""
+"""Build GATE rows from stored states and verdicts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -11,13 +11,11 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.mechanism.baselines import MARGIN, NoMargin, output_margins, probed_items, raw_features
-from traps_pipeline.mechanism.control_rows import GateRow, RiskCoverageRow
+from traps_pipeline.mechanism.baselines import output_or_note, probed_items, raw_features
+from traps_pipeline.mechanism.control_rows import STATES, GateRow
 from traps_pipeline.mechanism.gate import (
-    MID,
     OTHER_DATASETS,
     SOURCES,
     THRESHOLDS,
@@ -26,7 +24,6 @@ from traps_pipeline.mechanism.gate import (
     Outcomes,
     decide,
     families,
-    risk_coverage,
     separation,
     sources_of_gate,
 )
@@ -44,26 +41,27 @@ from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, draw_scenarios, 
 from traps_pipeline.scoring.metrics import COUNTS
 from traps_pipeline.storage.workspace import Workspace
 
-STATES, SHUFFLED, UNTRAINED, NO_GATE = "states", "shuffled labels", "untrained model", "no gate"
-COVERAGES = tuple(k / 20 for k in range(1, 21))
+SHUFFLED = "shuffled labels"
 ALL = "all"
 _PECS = RESAMPLED_FIGURES.index("pecs")
 
 
 @dataclass(frozen=True)
 class Gates:
-    """A kind of features, and the sources of its gates.
+    """Features that gates may read, and the datasets on which each gate is fitted.
 
-    by_layer: by layer of the states (-1 for other features), then by dataset, (n, d).
+    by_layer: by layer of the states (-1 for other features), then by dataset, (n, d). layers: the layer of each target;
+    none for other features.
     """
 
     name: str
     by_layer: Mapping[int, Mapping[str, np.ndarray]]
     sources: Sequence[str]
+    layers: Mapping[str, int] = field(default_factory=dict)
 
 
 Gated = dict[tuple[str, str], tuple[Decisions, int]]  # source and target -> decisions, and layer of the states
-_GATED: dict[str, dict[str, Gated]] = {}  # by digest of what decides them: those that this process has made
+DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
@@ -71,35 +69,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
     Raises TrapsError if the model has no verdicts yet.
     """
-    resamples, seed = workspace.mechanism.probes.resamples, workspace.mechanism.seed
-    return [
-        row
-        for regime, outcomes, features, gated in _each_regime(workspace, entry, states)
-        for source in dict.fromkeys(source for source, _ in gated)
-        for row in _rows(states, (features, regime, source), _of_source(gated, source), outcomes, resamples, seed)
-    ]
-
-
-def curve_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[RiskCoverageRow]:
-    """Return RISK_COVERAGE rows, as `gate_rows`, for gates from other datasets."""
-    return [
-        row
-        for regime, outcomes, features, gated in _each_regime(workspace, entry, states)
-        for row in _curves(states, features, regime, _of_source(gated, OTHER_DATASETS), outcomes)
-    ]
-
-
-DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions and layer
-
-
-def _of_source(gated: Gated, source: str) -> DecisionsByTarget:
-    return {target: decisions for (name, target), decisions in gated.items() if name == source}
-
-
-def _each_regime(
-    workspace: Workspace, entry: ModelEntry, states: StoredStates
-) -> Iterator[tuple[str, Mapping[str, Outcomes], str, Gated]]:
-    """Yield regime, its outcomes, features and the decisions of all gates on them."""
+    settings, rows = workspace.mechanism, list[GateRow]()
     outcomes = {
         regime: regime_outcomes
         for regime in PROMPTING
@@ -110,25 +80,16 @@ def _each_regime(
             f"gate {states.extraction.key}: {entry.id} has no verdicts under {' or '.join(PROMPTING)} in run 1; the "
             "experiment must ask the model under one of these regimes"
         )
-    for features, gated in _all_decisions(workspace, entry, states).items():
-        for regime in outcomes:
-            yield regime, outcomes[regime], features, gated
-
-
-def _all_decisions(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> dict[str, Gated]:
-    """Return the decisions of every kind of features, which `gate_rows` and `curve_rows` share."""
-    settings = workspace.mechanism
     layers = chosen_layers(workspace, states, dict.fromkeys(states.items["dataset"]))
-    probe_settings = settings.probes.model_dump(mode="json")
-    key = digest([states.digest, layers, probe_settings, settings.gate.model_dump(mode="json"), settings.seed])
-    if key not in _GATED:
-        table, kinds = gate_table(states), [*_kinds(workspace, entry, states, layers)]
-        gated_by_features: dict[str, Gated] = {}
-        for number, gates in enumerate(kinds):
-            progress.current().tick("gate", f"features of {states.extraction.key}", number + 1, len(kinds))
-            gated_by_features[gates.name] = _decisions(workspace, table, gates, layers)
-        _GATED[key] = gated_by_features
-    return _GATED[key]
+    table, kinds = gate_table(states), [*_kinds(workspace, entry, states, layers)]
+    for number, gates in enumerate(kinds, start=1):
+        progress.current().tick("gate", f"features of {states.extraction.key}", number, len(kinds))
+        gated = _decisions(workspace, table, gates)
+        for regime, source in product(outcomes, gates.sources):
+            decided = {target: decisions for (name, target), decisions in gated.items() if name == source}
+            about, resamples = (gates.name, regime, source), settings.probes.resamples
+            rows += _rows(states, about, decided, outcomes[regime], resamples, settings.seed)
+    return rows
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
@@ -150,21 +111,19 @@ def _kinds(workspace: Workspace, entry: ModelEntry, states: StoredStates, layers
     """Yield states by every source, and control features by sources of many datasets."""
     names = [*dict.fromkeys(states.items["dataset"])]
     states_by_layer = {layer: read_states(states, names, layer) for layer in sorted({*layers.values()})}
-    yield Gates(STATES, states_by_layer, SOURCES)
+    yield Gates(STATES, states_by_layer, SOURCES, layers)
     controls = (OTHER_DATASETS,)
     assert entry.media is not None, "local entries have media"
     items = {name: probed_items(workspace, states, name) for name in names}
     for name, features in raw_features(items, entry.media, workspace.resolve).items():
         yield Gates(name, {-1: features}, controls)
-    try:
-        yield Gates(MARGIN, {-1: output_margins(entry, states, names)}, controls)
-    except NoMargin as error:
-        progress.current().note(f"gate: no output margin ({error})")
-    yield Gates(SHUFFLED, states_by_layer, controls)
-    if workspace.mechanism.gate.untrained:
-        from traps_pipeline.mechanism.untrained import untrained_states
-
-        yield Gates(UNTRAINED, {-1: untrained_states(workspace, entry, states, items)}, controls)
+    for name, features in output_or_note("gate", entry, states, states, names).items():
+        yield Gates(name, {-1: features}, controls)
+    yield Gates(SHUFFLED, states_by_layer, controls, layers)
+    for random in StoredStates.of_random(workspace, entry.id):
+        own_layers = chosen_layers(workspace, random, names)
+        by_layer = {n: {d: random.read_as(states, d, n) for d in names} for n in sorted({*own_layers.values()})}
+        yield Gates(random.extraction.prompt, by_layer, controls, own_layers)
 
 
 def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[str, np.ndarray]:
@@ -172,7 +131,7 @@ def read_states(states: StoredStates, names: Sequence[str], layer: int) -> dict[
     return {name: states.read(name, layer) for name in names}
 
 
-def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: Mapping[str, int]) -> Gated:
+def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates) -> Gated:
     """Return decisions and states' layer (-1 for other features), by source, target."""
     settings, seed = workspace.mechanism, workspace.mechanism.seed
     settings_of_gate = {"folds": settings.probes.folds, "seed": seed, "false_abs": settings.gate.false_abs}
@@ -184,7 +143,7 @@ def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates, layers: 
     for source, target in product(gates.sources, dict.fromkeys(table["dataset"])):
         if not sources_of_gate(source, str(target), datasets):
             continue  # a study without all datasets has fewer gates
-        layer = layers[str(target)] if layers[str(target)] in gates.by_layer else -1
+        layer = gates.layers.get(str(target), -1)
         decision = decide(items_of[layer], source, str(target), **settings_of_gate)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer
@@ -295,38 +254,10 @@ def _row(
     figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
     row_keys: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
     return GateRow(
-        **states.extraction.partition,
+        **states.joined,
         **row_keys,
         **nan_to_null(figures),
         layer=layer,
         n_controls=sides[0],
         n_voids=sides[1],
     )
-
-
-def _curves(
-    states: StoredStates, features: str, regime: str, decided: DecisionsByTarget, outcomes: Mapping[str, Outcomes]
-) -> list[RiskCoverageRow]:
-    """Return risk against coverage over the four datasets together.
-
-    A score is relative to its own gate's mid threshold, so that the scores of four gates are comparable.
-    """
-    datasets = [name for name in decided if name in DATASETS]
-    if not datasets:
-        return []
-    score = np.concatenate([decided[name][0].score - decided[name][0].threshold[MID] for name in datasets])
-    parts = [outcomes[name] for name in datasets]
-    pooled_outcomes = Outcomes(
-        *(np.concatenate([getattr(part, f) for part in parts]) for f in ("void", "correct", "abstained"))
-    )
-    points = [(features, *point) for point in risk_coverage(score, pooled_outcomes, COVERAGES)]
-    if features == STATES:
-        n_answered = int((pooled_outcomes.abstained == 0).sum())
-        risk_of_item = np.where(pooled_outcomes.void, 1.0, 1 - pooled_outcomes.correct)[pooled_outcomes.abstained == 0]
-        points.append(
-            (NO_GATE, n_answered / len(score), float(np.nanmean(risk_of_item)) if n_answered else 0.0, n_answered)
-        )
-    return [
-        RiskCoverageRow(**states.extraction.partition, regime=regime, features=name, coverage=c, risk=r, n=n)
-        for name, c, r, n in points
-    ]

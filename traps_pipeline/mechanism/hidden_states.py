@@ -34,7 +34,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
 from traps_pipeline.models.local.spans import changed_tokens, spans
 from traps_pipeline.storage.leases import hold_lease, leased_ranges
-from traps_pipeline.storage.media import Frames, MediaSpec, profile_digest, sample
+from traps_pipeline.storage.media import MediaSpec, profile_digest, sample
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
 from traps_pipeline.storage.store import FolderStore
 
@@ -74,18 +74,17 @@ _Place = tuple[str, int, str]  # shard, row and device of an item's states
 
 def clip_item(
     model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], clip: Path, system: str,
-    times: Path | None = None, other: tuple[Path, str] | None = None,
+    other: tuple[Path, str] | None = None,
 ) -> Item:  # fmt: skip
     """Return the item that asks a question about a clip under a system prompt.
 
-    row: a row of the items table (item_id, side, question, media_digest; times_digest if `times` is given). spec: how
-    the model is shown a clip. times: another clip, whose frame times replace the clip's own. other: the pair's other
-    clip and its SHA-256, if the pooling depends on it.
+    row: a row of the items table (item_id, side, question, media_digest). spec: how the model is shown a clip. other:
+    the pair's other clip and its SHA-256, if the pooling depends on it.
     """
 
     def asked(frames_of: Path) -> Prompt:
         frames = sample(frames_of, spec)
-        return model.prompt(system, row["question"], frames.frames, shown_times(frames, frames_of, spec, times))
+        return model.prompt(system, row["question"], frames.frames, frames.times_s)
 
     key_parts = {
         "question": row["question"],
@@ -93,22 +92,10 @@ def clip_item(
         "media": profile_digest(spec),
         "system": system,
     }
-    if times is not None:
-        key_parts["times"] = row["times_digest"]
     key_parts |= {"other": other[1]} if other else {}
     return Item(
         row["item_id"], row["side"], key_parts, partial(asked, clip), partial(asked, other[0]) if other else None
     )
-
-
-def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
-    """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
-    if times is None or times == clip:
-        return shown.times_s
-    sampled_s = sample(times, spec).times_s
-    if len(sampled_s) == len(shown.times_s):
-        return sampled_s
-    return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(sampled_s)), sampled_s)
 
 
 def states_key(model: LocalModel, item: Item, pooling: Pooling) -> str:

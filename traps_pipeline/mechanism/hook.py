@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -35,6 +35,9 @@ def register_change(block: Module, site: Site, change: Callable[[Tensor], Tensor
     It runs before all others, so that hooks that record states record the changed ones. Raises TrapsError for a block
     without such a part.
     """
+
+    if site != "residual" and site not in _PARTS:
+        raise TrapsError(f"no site {site!r}; states can be changed at {', '.join(get_args(Site))}")
 
     def hook(_: Module, __: Any, output: Any) -> Any:
         new_states = change(first_tensor(output))

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from traps_pipeline.base import progress
-from traps_pipeline.mechanism.baselines import NoMargin, output_margins
+from traps_pipeline.mechanism.baselines import MARGIN, output_or_note
 from traps_pipeline.mechanism.control_rows import ItemScoreRow
 from traps_pipeline.mechanism.gate import MID, OTHER_DATASETS, decide, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table, outcomes_of, read_states
@@ -28,13 +27,9 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
     datasets = [name for name in DATASETS if len(states.dataset(name))]
     layers = chosen_layers(workspace, states, datasets)
     outcomes = {regime: outcomes_of(workspace, entry.id, regime, states) for regime in PROMPTING}
-    try:
-        margins = output_margins(entry, states, datasets)
-    except NoMargin as error:
-        progress.current().note(f"item_scores: no output margin ({error})")
-        margins = {}
+    margins = output_or_note("item_scores", entry, states, states, datasets).get(MARGIN, {})
     probe_settings = {"folds": settings.probes.folds, "seed": settings.seed, "false_abs": settings.gate.false_abs}
-    rows: list[ItemScoreRow] = []
+    rows, joined = list[ItemScoreRow](), states.joined
     for dataset in datasets:
         features = read_states(states, [*dict.fromkeys(table["dataset"])], layers[dataset])
         scores: dict[str, np.ndarray] = {}
@@ -50,7 +45,7 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
             }
             rows.append(
                 ItemScoreRow(
-                    **states.extraction.partition,
+                    **joined,
                     **{name: item[name] for name in ("item_id", "dataset", "scenario_id", "side")},
                     layer=layers[dataset],
                     own=_number(scores["own"][place]),

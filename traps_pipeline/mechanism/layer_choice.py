@@ -17,11 +17,10 @@ import numpy as np
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
-from traps_pipeline.protocol.datasets import DATASETS, TIME_SWAPPED, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 
 Curves = Mapping[tuple[str, str], Mapping[int, float]]
 ROUNDING = 1e-9
-LOOKS_LIKE = {**LOOK_ALIKES, TIME_SWAPPED: "chaotic"}  # use the layer of the dataset that they resemble
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
     In a study with fewer than three datasets no pair is left: then the other dataset's own held-out figure counts,
     which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any figure.
     """
-    target = LOOKS_LIKE.get(target, target)
+    target = LOOK_ALIKES.get(target, target)  # read at the layer of the dataset that it resembles
     other_pairs = [pair for pair in curves if target not in pair]
     pairs = [pair for pair in other_pairs if pair[0] != pair[1]] or other_pairs or [*curves]
     if not pairs:

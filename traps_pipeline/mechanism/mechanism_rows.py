@@ -71,8 +71,7 @@ class ProbeItemRow:
     pair_id: shared.PairId
     dataset: Annotated[
         str,
-        "one of four; occlusion_answerable: the void clips of occlusion with a question that they answer; "
-        "chaotic_time_swapped: clips with the frame times of the other side; or an arm",
+        "one of four; occlusion_answerable: the void clips of occlusion with a question that they answer; or an arm",
     ]
     scenario_id: shared.ScenarioId
     side: Annotated[str, "control (it can be answered) or void"]
@@ -81,8 +80,6 @@ class ProbeItemRow:
     question: shared.Question
     clip: shared.ClipPath
     media_digest: shared.MediaDigest
-    times_clip: Annotated[str | None, "clip whose frame times are shown; null: the item's own"]
-    times_digest: Annotated[str | None, "digest of that clip's file"]
     benchmark_version: shared.BenchmarkVersion
 
 
@@ -123,7 +120,7 @@ class ProbeRow(ExtractionColumns):
     analysis: Annotated[
         str,
         "transfer, held_out, confabulated, confabulated_held_out, within, shuffled, answerable_void, "
-        "answerable_control, time_swapped or centroid_..",
+        "answerable_control or centroid_..",
     ]
     source: Annotated[str, "dataset that the probe or the centroids were fitted on"]
     target: Annotated[str, "dataset that they were applied to"]
@@ -218,7 +215,8 @@ class SteeringRow(SteeredCell):
     served_model: Annotated[str | None, "checkpoint, digest and precision that answered"]
     completion_tokens: shared.Tokens
     degenerate: Annotated[
-        str | None, "why the text is no answer: truncated, empty, repetition or script; null if it is one"
+        str | None,
+        "why the text is no answer: truncated, empty, letters (none), repetition, script; null if it is one",
     ]
     direction_digest: Annotated[str | None, "digest of the direction's numbers"]
     request_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]
@@ -232,6 +230,28 @@ STEERING = Table(
     SteeringRow,
     partition_by=("dataset", "model", "directions", "regime"),
     key=("source", "kind", "draw", "layer", "unit", "dose", "signs", "item_id"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringFluencyRow:
+    """How likely the unsteered model finds a steered answer to its own prompt."""
+
+    dataset: Target
+    model: shared.Model
+    directions: DirectionPrompt
+    regime: AnswerRegime
+    item_id: shared.ItemId
+    request_key: Annotated[str, "of the answer, as in steering"]
+    nats: Annotated[float, "mean negative log-probability of the text's tokens"]
+    tokens: Annotated[int, "tokens of the text"]
+
+
+STEERING_FLUENCY = Table(
+    "steering_fluency",
+    SteeringFluencyRow,
+    partition_by=("dataset", "model", "directions", "regime"),
+    key=("item_id", "request_key"),
 )
 
 
@@ -285,7 +305,11 @@ class SteeringEffectRow:
     n: Annotated[int, "decided answers, one per scenario"]
     n_missing: Annotated[int, "answers missing or undecided"]
     abstained: Annotated[int, "decided answers that abstain"]
-    abstention: Annotated[float | None, "abstained / n"]
+    abstention: Annotated[float, "abstained / (n + n_missing): an undecided answer is no abstention"]
+    undecided: Annotated[float, "n_missing / (n + n_missing)"]
+    perplexity: Annotated[
+        float | None, "of the answers under the unsteered model: e to the mean nats a token; null without a text"
+    ]
     low: shared.Wilson
     high: shared.Wilson
     correct: Annotated[int, "answers to controls that are correct"]
@@ -318,10 +342,11 @@ class SteeringShareRow:
     alpha: Alpha
     side: shared.Side
     n_paths: Annotated[int, "paths that were steered"]
-    n: Annotated[int, "decided answers over paths and regimes; an answer counts once in each of its paths"]
+    n: Annotated[int, "answers over paths and regimes; an answer counts once in each of its paths"]
     n_answers: Annotated[int, "distinct answers among them, by ledger key"]
     n_scenarios: Annotated[int, "distinct scenarios of these answers"]
-    abstention: Annotated[float, "share of decided answers that abstain, mean over paths and regimes"]
+    abstention: Annotated[float, "share of answers that abstain, mean over paths and regimes"]
+    undecided: Annotated[float, "share of answers that neither abstain nor answer"]
     low: Annotated[float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen"]
     high: Annotated[float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen"]
     epoch: shared.AnswerEpochs

@@ -52,7 +52,7 @@ def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
         for null_kind in NULLS:
             draws = group.loc[group["kind"] == null_kind].groupby("draw")
             same_targets = void.loc[void["target"].isin(set(group.loc[group["kind"] == null_kind, "target"]))]
-            values = draws["moved"].mean().dropna().to_numpy(float)  # leave out draws without a decided answer
+            values = draws["moved"].mean().to_numpy(float)
             if not len(values) or same_targets["moved"].isna().any() or same_targets.empty:
                 continue
             effect = float(same_targets["moved"].mean())
@@ -69,9 +69,19 @@ def _rank(moved: pd.DataFrame, target: str) -> Iterator[SteeringNullRow]:
                 draws=len(values),
                 n_at_least=n_reaching,
                 p=(1 + n_reaching) / (1 + len(values)),
-                n=int(same_targets["n"].sum()),
+                n=int(same_targets[["n", "n_missing"]].to_numpy().sum()),
+                **_beside(same_targets, ""),
+                **_beside(group.loc[group["kind"] == null_kind], "null_"),
                 epoch=joined_epochs(same_targets["epoch"]),
             )
+
+
+def _beside(effects: pd.DataFrame, prefix: str) -> dict[str, Any]:
+    """Return the undecided share, and the mean perplexity, of the answers behind effects."""
+    columns = {name: effects[name].to_numpy(float) for name in ("undecided", "perplexity")}
+    known = {name: values[np.isfinite(values)] for name, values in columns.items()}
+    figures = {name: float(values.mean()) if len(values) else np.nan for name, values in known.items()}
+    return {f"{prefix}{name}": value for name, value in nan_to_null(figures).items()}
 
 
 def nan_to_null(figures: Mapping[str, float]) -> dict[str, Any]:
@@ -102,6 +112,8 @@ def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
                 **dict(zip(keys, key if isinstance(key, tuple) else (key,), strict=True)),
                 **nan_to_null(figures),
                 degenerate=(control["degenerate"] + void["degenerate"]) / answers,
+                undecided=(control["n_missing"] + void["n_missing"]) / answers,
+                perplexity=_beside(group, "")["perplexity"],
                 n_controls=int(control["n"]),
                 n_voids=int(void["n"]),
                 epoch=joined_epochs([control["epoch"], void["epoch"]]),

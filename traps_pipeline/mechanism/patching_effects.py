@@ -39,7 +39,14 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import first_token_margins
 from traps_pipeline.models.local.capture import first_tensor
-from traps_pipeline.models.local.sidepaths import PER_LAYER, SHARED_KEYS, argument_of, unknown_path, with_argument
+from traps_pipeline.models.local.sidepaths import (
+    CACHE_NAMES,
+    PER_LAYER,
+    SHARED_KEYS,
+    argument_of,
+    unknown_path,
+    with_argument,
+)
 from traps_pipeline.models.local.spans import visual_tokens
 
 if TYPE_CHECKING:
@@ -80,7 +87,7 @@ class RecordedPass:
 
     @property
     def length(self) -> int:
-        """The number of tokens."""
+        """The number of tokens of the prompt."""
         return int(self.inputs["inputs_embeds"].shape[1])
 
     @property
@@ -297,7 +304,7 @@ def _repeat_inputs(target: RecordedPass, rows: int) -> dict[str, Any]:
             axis = 0 if value.shape[0] == 1 else 1  # positions of several kinds have an axis before that of the rows
             if value.shape[axis] == 1 and length in value.shape:
                 inputs[name] = value.repeat_interleave(rows, dim=axis)
-    return inputs | {"use_cache": False, "past_key_values": None}
+    return inputs | {"use_cache": False} | dict.fromkeys({*CACHE_NAMES} & {*inputs})
 
 
 @contextmanager

@@ -24,7 +24,6 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.control_rows import PatchingRow
 from traps_pipeline.mechanism.directions import seeded_order
-from traps_pipeline.mechanism.hidden_states import shown_times
 from traps_pipeline.mechanism.hook import Site
 from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
@@ -43,7 +42,7 @@ from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.scoring.bootstrap import TAXONOMIES, draw_scenarios, interval, shares_of, with_unseen
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import Frames, MediaSpec, sample
 from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -358,3 +357,13 @@ def effect_of(
     ends = shares_of(with_unseen(sums.T, np.array([len(change)]), resampling.unseen("effect", decisions=1)))
     low, high = interval(ends[:, 0, 1:], effect, (-np.inf, np.inf))
     return effect, float(low), float(high)
+
+
+def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
+    """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
+    if times is None or times == clip:
+        return shown.times_s
+    sampled_s = sample(times, spec).times_s
+    if len(sampled_s) == len(shown.times_s):
+        return sampled_s
+    return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(sampled_s)), sampled_s)

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.items import categories_of_dataset
 from traps_pipeline.mechanism.mechanism_rows import ProbeItemRow
-from traps_pipeline.protocol.datasets import ANSWERABLE, TIME_SWAPPED
+from traps_pipeline.protocol.datasets import ANSWERABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -22,17 +20,12 @@ COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "questio
 def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
     """Return rows of a dataset's probe_items.
 
-    These are the dataset's items; occlusion's void clips with the answerable question; or chaotic's clips with the
-    frame times of the other side.
+    These are the dataset's items, or occlusion's void clips with the answerable question.
     """
-    if dataset == TIME_SWAPPED:
-        return time_swapped(workspace.tables.read(ITEMS, {"dataset": "chaotic"}))
     if dataset != ANSWERABLE:
         rows = workspace.tables.read(ITEMS, {"dataset": dataset}).to_dict("records")
         columns = ("item_id", "dataset", *COPIED, "benchmark_version")
-        return [
-            ProbeItemRow(**{name: row[name] for name in columns}, times_clip=None, times_digest=None) for row in rows
-        ]
+        return [ProbeItemRow(**{name: row[name] for name in columns}) for row in rows]
     rows = []
     for category in categories_of_dataset("occlusion"):
         if workspace.tables.state(SCENE_SPECS, {"category": category}) is None:
@@ -40,6 +33,8 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
         clips = workspace.tables.read(VIDEOS, {"category": category})
         voids = clips.loc[clips["side"] == "void"].set_index("scenario_id")
         for spec in workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records"):
+            if spec["answerable_question"] == "null":  # recorded
+                continue
             if spec["scenario_id"] not in voids.index:
                 raise TrapsError(f"{spec['scenario_id']}: has no void clip yet; materialize videos for {category}")
             rows.append(_answerable_item(spec, voids.loc[spec["scenario_id"]].to_dict()))
@@ -75,31 +70,4 @@ def _answerable_item(spec: Mapping[str, Any], clip: Mapping[str, Any]) -> ProbeI
         question=json.loads(spec["answerable_question"])["question"],
         clip=clip["path"],
         media_digest=clip["file_sha256"],
-        times_clip=None,
-        times_digest=None,
     )
-
-
-def time_swapped(items: pd.DataFrame) -> list[ProbeItemRow]:
-    """Return chaotic's pairs (ITEMS rows) with the frame times of the other side.
-
-    A probe that reads time stamps takes a control for a void and a void for a control. A scenario without both sides is
-    left out.
-    """
-    rows: list[ProbeItemRow] = []
-    for _, pair in items.groupby("scenario_id", sort=True):
-        sides = {str(row["side"]): row for row in pair.to_dict("records")}
-        if len(sides) < 2:
-            continue
-        for side, other_side in (("control", "void"), ("void", "control")):
-            row, name = sides[side], f"{TIME_SWAPPED}:{sides[side]['scenario_id']}"
-            rows.append(
-                ProbeItemRow(
-                    **{name: row[name] for name in (*COPIED, "benchmark_version")} | {"pair_id": name},
-                    item_id=f"{name}:{side}",
-                    dataset=TIME_SWAPPED,
-                    times_clip=sides[other_side]["clip"],
-                    times_digest=sides[other_side]["media_digest"],
-                )
-            )
-    return rows

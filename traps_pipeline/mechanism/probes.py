@@ -209,17 +209,23 @@ def auroc_interval(
     weights: (resamples, scenarios), how often each is drawn (`scoring.bootstrap.scenario_weights`); scenario: (n,), the
     column of `weights` for each item. A resample in which a class is empty is dropped.
     """
+    void, areas = np.asarray(void, bool), auroc_draws(void, scores, scenario, weights)
+    if np.isnan(areas).all():
+        return np.nan, np.nan
+    low, high = np.nanquantile(areas, [(1 - level) / 2, (1 + level) / 2])
+    certain_share = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
+    return min(float(low), certain_share), max(float(high), 1 - certain_share)
+
+
+def auroc_draws(void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the AUROC of each resample of `auroc_interval`, (resamples,); NaN without one of the classes."""
     void = np.asarray(void, bool)
     void_scores, control_scores = scores[void][:, None], scores[~void][None, :]
     win_weights = (void_scores > control_scores).astype(np.float32) + np.float32(0.5) * (void_scores == control_scores)
     times_void, times_control = weights[:, scenario[void]], weights[:, scenario[~void]]
     won_weight = ((times_void @ win_weights) * times_control).sum(axis=1, dtype=float)
     pairs = times_void.sum(axis=1, dtype=float) * times_control.sum(axis=1, dtype=float)
-    if not (pairs > 0).any():
-        return np.nan, np.nan
-    low, high = np.quantile(won_weight[pairs > 0] / pairs[pairs > 0], [(1 - level) / 2, (1 + level) / 2])
-    certain_share = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
-    return min(float(low), certain_share), max(float(high), 1 - certain_share)
+    return np.divide(won_weight, pairs, out=np.full(len(pairs), np.nan), where=pairs > 0)
 
 
 # --- within a split ---------------------------------------------------------------------------------------------------

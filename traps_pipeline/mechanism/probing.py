@@ -37,7 +37,7 @@ from traps_pipeline.mechanism.transfer_paths import (
     path_name,
     probed_taxonomy,
 )
-from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, TIME_SWAPPED, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.study import ProbeSettings
 
@@ -134,10 +134,16 @@ class ProbeRun:
 
     # --- the parts of the protocol ---
 
-    def rows(self, progress: Callable[[int, int], None] = lambda layers_done, total: None) -> list[Row]:
-        """Return every row of the probes table without the columns that partition it."""
+    def rows(
+        self, progress: Callable[[int, int], None] = lambda layers_done, total: None, *, comparable: bool = False
+    ) -> list[Row]:
+        """Return every row of the probes table without the columns that partition it.
+
+        comparable: without those within a dataset and those of centroids.
+        """
         rows: list[Row] = []
-        for layers_done, layer_rows in enumerate(each_layer(self.layer_rows, self.n_layers), start=1):
+        of_layer = self.comparable_rows if comparable else self.layer_rows
+        for layers_done, layer_rows in enumerate(each_layer(of_layer, self.n_layers), start=1):
             rows += layer_rows
             progress(layers_done, self.n_layers)
         return mark_layers(rows + self._problems())
@@ -149,12 +155,12 @@ class ProbeRun:
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
 
     def comparable_rows(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """Return one layer's rows that baselines share, from transfer to swapped times."""
+        """Return one layer's rows that baselines share, from transfer to look-alikes."""
         splits = splits or {name: self._split(name, layer) for name in self._datasets}
         unseen_scores = {source: self._unseen_scores(source, splits) for source in self._own}
         rows = self.transfer(layer, splits) + self.held_out(layer, splits, unseen_scores)
         rows += self.confabulated_transfer(layer, splits) + self.confabulated_held_out(layer, splits)
-        return rows + self.answerable(layer, splits, unseen_scores) + self.time_swapped(layer, splits, unseen_scores)
+        return rows + self.answerable(layer, splits, unseen_scores)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
         """Return the twelve ordered pairs on all samples.
@@ -255,17 +261,6 @@ class ProbeRun:
                 split = Split(values[:, None], labels, scenario)
                 rows.append(self._score_row(analysis, (source, extra), layer, split, values))
         return rows
-
-    def time_swapped(
-        self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
-    ) -> list[Row]:
-        """Return AUROC on swapped times: 1 by reading frames, 0 by reading time stamps."""
-        if TIME_SWAPPED not in splits:
-            return []
-        split = splits[TIME_SWAPPED]
-        return [
-            self._score_row("time_swapped", (s, TIME_SWAPPED), layer, split, unseen[s][TIME_SWAPPED]) for s in self._own
-        ]
 
     @staticmethod
     def _side(

@@ -35,6 +35,24 @@ def mechanism_entry(entry: ModelEntry, settings: MechanismSettings) -> ModelEntr
     return entry if media is None else entry.model_copy(update={"media": media})
 
 
+def joined_models(entry: ModelEntry, settings: MechanismSettings) -> str | None:
+    """Return which two models a row joins that has a model's states and its answers; None for one.
+
+    They are two if the entry is looked into in another precision than it answers in, or on other frames.
+    """
+    states, answers = mechanism_entry(entry, settings).media, entry.media
+    inside, asked = entry.inside_params(), entry.local_params()
+    if (inside, states) == (asked, answers):
+        return None
+    sides = (("states", inside, states), ("answers", asked, answers))
+    return "; ".join(
+        f"{name}: {params.dtype if params.quantisation == 'none' else params.quantisation}, "
+        + (f"{media.uniform} frames" if media.uniform else f"{media.fps:g} frames a second")
+        for name, params, media in sides
+        if media
+    )
+
+
 def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
     """Return the folder of a partition's shards."""
     return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset
@@ -67,8 +85,10 @@ def extraction_version(workspace: Workspace, extraction: Extraction) -> str:
         entry = mechanism_entry(entry, settings)
     media = profile_digest(entry.media) if entry.media else None
     pooling = settings.pooling if settings else None
-    system = states_prompt(settings.system if settings else "vqa", extraction.prompt)
+    system = states_prompt(settings.system if settings else "vqa", extraction.text)
     made_of = [loaded_params(entry), media, system, pooling]
+    if extraction.weights_seed is not None:
+        made_of.append(extraction.weights_seed)
     if pooling in OF_PAIRS:  # an item's states depend on the other clip of its scenario, which is not in its own table
         made_of.append(sorted(workspace.tables.read_all(VIDEOS, ["file_sha256"])["file_sha256"]))
     return digest(made_of)[:16]
@@ -93,7 +113,7 @@ def sentence_version(workspace: Workspace, extraction: Extraction) -> str:
     settings = workspace.study.mechanism
     if settings is None or extraction.model not in settings.models:
         return "none"
-    prompt = system_prompt(extraction.prompt)
+    prompt = system_prompt(extraction.text)
     return digest([extraction_version(workspace, extraction), list(settings.sentences), prompt])[:16]
 
 

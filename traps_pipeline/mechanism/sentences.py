@@ -15,9 +15,11 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.control_rows import SentenceRow
 from traps_pipeline.mechanism.margin import head_logits
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
+from traps_pipeline.mechanism.probing_versions import joined_models
 from traps_pipeline.mechanism.stages import probed_item
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.models.registry.entries import ModelEntry
+from traps_pipeline.models.local.sidepaths import cache_argument
+from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
@@ -39,6 +41,7 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
 
     assert entry.media is not None, "local entries have media"
     model, regime, rows = load_local_model(entry, inside=True), extraction.prompt, list[SentenceRow]()
+    joined = {**extraction.partition, "joins": joined_models(get_model(entry.id), workspace.mechanism)}
     sentences = {text: answer_tokens(model, text) for text in workspace.mechanism.sentences}
     for dataset in DATASETS:
         cell = Cell(dataset, Evaluation(entry.id, regime, 1))
@@ -60,7 +63,7 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
             best = max(log_probability_of, key=lambda name: log_probability_of[name])
             rows.append(
                 SentenceRow(
-                    **extraction.partition,
+                    **joined,
                     **{name: item_columns[name] for name in ("item_id", "dataset", "scenario_id", "side")},
                     sentence=best,
                     abstention=log_probability_of[best],
@@ -94,7 +97,8 @@ def mean_log_probabilities(model: LocalModel, prompt: Prompt, answers: Sequence[
     with torch.inference_mode():
         output = model.network.base_model(**model.placed(prompt.inputs), use_cache=True)
         output.past_key_values.batch_repeat_interleave(len(answers))
-        behind = model.network.base_model(input_ids=rows, past_key_values=output.past_key_values)
+        read = {cache_argument(model.network.base_model): output.past_key_values}
+        behind = model.network.base_model(input_ids=rows, **read)
         ends = output.last_hidden_state[:, -1:].expand(len(answers), -1, -1)
         states = torch.cat([ends, behind.last_hidden_state[:, :-1].to(ends.device)], dim=1)
         chances = head_logits(model, states).log_softmax(-1).gather(-1, rows[..., None].to(ends.device))[..., 0]

@@ -47,10 +47,16 @@ def paper_protocol_rows(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
 
-def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return answers with verdicts, one row per path; alpha 0 belongs to every path."""
+def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame, fluency: pd.DataFrame | None = None) -> pd.DataFrame:
+    """Return answers with verdicts, one row per path; alpha 0 belongs to every path.
+
+    fluency: rows of STEERING_FLUENCY; column `nats` is null without them.
+    """
     columns = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
     judged_answers = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *columns]]), votes)
+    keys = [*_CELL, "item_id", "request_key"]
+    nats = pd.DataFrame(columns=[*keys, "nats"]) if fluency is None else fluency[[*keys, "nats"]]
+    judged_answers = judged_answers.merge(nats, on=keys, how="left")
     steered_answers = judged_answers.loc[judged_answers["kind"] != UNSTEERED]
     unsteered_answers = judged_answers.loc[judged_answers["kind"] == UNSTEERED].drop(columns=_ALONG)
     keys = [*_RUN, "dataset", "side", "scenario_id"]  # compare a path with unsteered answers to its scenarios
@@ -77,15 +83,18 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffectRow]:
+def effect_rows(
+    answers: pd.DataFrame, votes: pd.DataFrame, fluency: pd.DataFrame | None = None
+) -> list[SteeringEffectRow]:
     """Return STEERING_EFFECTS rows: abstention by path, dose, kind, draw, layer, side."""
     rows: list[SteeringEffectRow] = []
-    for key, group in answers_of_paths(answers, votes).groupby(_EFFECT, sort=True):
+    for key, group in answers_of_paths(answers, votes, fluency).groupby(_EFFECT, sort=True):
         row_keys = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
         target = row_keys.pop("dataset")
         abstentions, correct = (group[name].dropna().to_numpy(bool) for name in ("abstained", "correct"))
         n, yes = len(abstentions), int(np.count_nonzero(abstentions))
-        low, high = wilson(np.array([yes]), np.array([n]))
+        low, high = wilson(np.array([yes]), np.array([len(group)]))
+        nats = group["nats"].dropna().to_numpy(float)
         relative = group["alpha_relative"].dropna()
         rows.append(
             SteeringEffectRow(
@@ -100,7 +109,9 @@ def effect_rows(answers: pd.DataFrame, votes: pd.DataFrame) -> list[SteeringEffe
                 n=n,
                 n_missing=len(group) - n,
                 abstained=yes,
-                abstention=yes / n if n else None,
+                abstention=yes / len(group),
+                undecided=1 - n / len(group),
+                perplexity=float(np.exp(nats.mean())) if len(nats) else None,
                 low=float(low[0]),
                 high=float(high[0]),
                 epoch="+".join(sorted(set(group["epoch"]))),
@@ -117,19 +128,20 @@ def share_rows(
     There are rows for each regime of directions and of answers and over all regimes, with an interval from resampled
     scenarios (all paths share the scenarios of a resample, and the unseen one).
     """
-    decided_answers = answers_of_paths(paper_protocol_rows(answers), paper_protocol_rows(votes)).dropna(
-        subset=["abstained"]
-    )
-    decided_answers = decided_answers.merge(
-        decided_answers.loc[decided_answers["side"] == "void", ["model", "layer"]].drop_duplicates()
+    path_answers = answers_of_paths(paper_protocol_rows(answers), paper_protocol_rows(votes))
+    path_answers = path_answers.merge(
+        path_answers.loc[path_answers["side"] == "void", ["model", "layer"]].drop_duplicates()
     )  # no sweep
+    path_answers = path_answers.assign(
+        undecided=path_answers["abstained"].isna(), abstained=path_answers["abstained"].eq(True).fillna(False)
+    )
     rows: list[SteeringShareRow] = []
-    for _, model_answers in decided_answers.groupby("model", sort=True):
+    for _, model_answers in path_answers.groupby("model", sort=True):
         paths = pd.DataFrame(model_answers[_PATH]).drop_duplicates(ignore_index=True)
-        path_answers = model_answers.merge(paths.reset_index(names="path"), on=_PATH)
-        ends = _shares(path_answers, len(paths), resamples, seed)
+        numbered = model_answers.merge(paths.reset_index(names="path"), on=_PATH)
+        ends = _shares(numbered, len(paths), resamples, seed)
         for pool, members in _pools(paths):
-            pool_answers = path_answers.loc[np.isin(path_answers["path"], members)]
+            pool_answers = numbered.loc[np.isin(numbered["path"], members)]
             mean_ends = ends[:, members].mean(axis=1)
             low, high = interval(mean_ends[:, 1:], mean_ends[0, 0], (0.0, 1.0))
             rows.append(
@@ -140,6 +152,7 @@ def share_rows(
                     n_answers=len(set(pool_answers["request_key"])),
                     n_scenarios=len(set(pool_answers["scenario_id"])),
                     abstention=float(mean_ends[0, 0]),
+                    undecided=float(pool_answers.groupby("path")["undecided"].mean().mean()),
                     low=float(low),
                     high=float(high),
                     epoch="+".join(sorted(set(pool_answers["epoch"]))),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +78,8 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     entry, settings = examined_model(workspace, cell.extraction.model), workspace.mechanism
     assert entry.media is not None, "local entries have media"
     items = workspace.tables.read(PROBE_ITEMS, {"dataset": cell.dataset}).to_dict("records")
-    model, system = load_local_model(entry, inside=True), states_prompt(settings.system, cell.extraction.prompt)
+    model = load_local_model(entry, inside=True, seed=cell.extraction.weights_seed)
+    system = states_prompt(settings.system, cell.extraction.text)
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
     asked_of = [
@@ -119,9 +121,8 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
     from traps_pipeline.mechanism.hidden_states import clip_item
     from traps_pipeline.models.local.capture import OF_PAIRS
 
-    times = workspace.resolve(row["times_clip"]) if isinstance(row["times_clip"], str) else None
     other_prompt = other_clip(workspace, row) if workspace.mechanism.pooling in OF_PAIRS else None
-    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, times, other_prompt)
+    return clip_item(model, spec, row, workspace.resolve(row["clip"]), system, other_prompt)
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
@@ -154,7 +155,8 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
     """Return rows of an extraction's probes, the existing ones if no input changed."""
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
-    confabulated = confabulations(workspace, extraction.model)
+    is_random = extraction.weights_seed is not None  # which answers nothing
+    confabulated = Confabulated({}) if is_random else confabulations(workspace, extraction.model)
     layers = settings.models[extraction.model]
     made_of = digest(
         [
@@ -169,7 +171,8 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
         return known_rows
     centroid, n_layers = layers.centroid, states.n_layers
     run = ProbeRun(states.items, states.read, n_layers, centroid, settings.probes, settings.seed, confabulated)
-    rows = run.rows(lambda done, total: progress.current().tick("probes", f"layers of {extraction.key}", done, total))
+    tick = partial(progress.current().tick, "probes", f"layers of {extraction.key}")
+    rows = run.rows(tick, comparable=is_random)
     return [ProbeRow(**row, model=extraction.model, prompt=extraction.prompt, made_of=made_of) for row in rows]
 
 

@@ -1,7 +1,6 @@
 """Answer steered requests on a local model.
 
-Requests of one layer are generated together; answers that another process of the machine has generated are reused
-(`shared_answers`).
+Requests of one layer are generated together.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.mechanism.shared_answers import SharedAnswers
 from traps_pipeline.models.local.backend import LocalBackend, outcome
 from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
@@ -28,14 +26,14 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 class SteeredBackend(LocalBackend):
     """A local model that answers with a direction added to a block, one for each row."""
 
-    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray], shared: SharedAnswers) -> None:
+    def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray]) -> None:
         super().__init__(entry)
-        self._vectors, self._made = vectors, shared
+        self._vectors = vectors
         self._prompt = lru_cache(PROMPTS_KEPT)(self._make_prompt)
 
     def _answer_batch(self, batch: _Batch) -> list[Outcome]:
-        """Answer a batch, in the worker thread, except for answers from another process."""
-        return self._made.outcomes(batch.requests, self.generate, batch.abandoned.is_set)
+        """Answer a batch, in the worker thread."""
+        return self.generate(batch.requests, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
         """Answer requests in groups by layer, unsteered ones apart.

@@ -6,7 +6,7 @@ three, so that all directions share one answer. The two datasets of a taxonomy h
 their answers too; so do two sign policies that add the same.
 
 Doses are given as alphas, as in the paper, and in units of the class gap, since one alpha is a large step in one model
-and none in another. Nulls are steered at the largest dose, along the direction of the dataset that is steered.
+and none in another. Nulls are steered at every alpha and at the largest gap, beside the dataset's own direction.
 """
 
 from __future__ import annotations
@@ -18,14 +18,12 @@ from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
-from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.panel import Ballot, ask_judges, judged_answers, tasks_for, vote_columns, vote_requests
 from traps_pipeline.mechanism.degeneracy import degeneracy
 from traps_pipeline.mechanism.directions import Directions, steered_scenarios, vector_digest
 from traps_pipeline.mechanism.mechanism_rows import STEERING, SteeringRow, SteeringVoteRow
 from traps_pipeline.mechanism.probing_versions import loaded_params
-from traps_pipeline.mechanism.shared_answers import SharedAnswers, is_written, make_meanwhile
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.asking.answers import Question
@@ -91,7 +89,7 @@ class SteeredQuestion(Question):
 def strengths(
     target: str, layers: Layers, settings: MechanismSettings, directions: Mapping[str, Directions]
 ) -> list[tuple[Strength, tuple[str, ...]]]:
-    """Return the strengths at which a target is steered, each with its sides.
+    """Return every strength at which a target is steered, with the sides that are steered so.
 
     These are every path into the target whose source has a direction, the random and shuffled directions of that
     source, and the sweep over layers (along the target's own direction, only on controls). directions: by source.
@@ -127,19 +125,20 @@ Dose = tuple[str, float]  # unit and number
 
 
 def _doses_within(row: _Planned, of: Directions, layer: int, cap: float) -> Sequence[Dose]:
-    """Return the doses of a direction within the cap.
-
-    Left out are those in class gaps beyond `cap` control states.
-
-    A null has only the largest one.
-    """
+    """Return the doses of a direction, without those in class gaps beyond `cap` control states."""
     longest = cap * float(of.residual_norms[layer]) * (1 + 1e-9)
-    doses = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
-    return doses if row.kind == "void" else doses[-1:]
+    within = [(unit, dose) for unit, dose in row.doses if unit == "alpha" or dose * float(of.gaps[layer]) <= longest]
+    return _doses_of(row.kind, within)
+
+
+def _doses_of(kind: str, doses: Sequence[Dose]) -> Sequence[Dose]:
+    """Return the doses of a kind of direction: a null has those that claims read, every alpha and the largest gap."""
+    gaps = [dose for dose in doses if dose[0] == "gap"]
+    return doses if kind == "void" else [*(dose for dose in doses if dose[0] != "gap"), *gaps[-1:]]
 
 
 class _Planned(NamedTuple):
-    """A direction to steer along, with sides and doses (only the top dose for a null)."""
+    """A direction to steer along, with sides and doses."""
 
     source: str
     kind: str
@@ -153,8 +152,8 @@ class _Planned(NamedTuple):
 def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]) -> list[_Planned]:
     """Return every direction along which a target is steered, among these sources.
 
-    These are all paths into it; along its own direction also the other sign policies, the nulls at the largest dose,
-    and on controls the sweep over layers.
+    These are all paths into it; along its own direction also the other sign policies, the nulls, and on
+    controls the sweep over layers.
     """
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
@@ -186,8 +185,10 @@ def count_answers(
         for row in _plan(target, settings.models[model], steering, datasets):
             if side in row.sides:
                 along = (owner, side, row.source, row.kind, row.draw, row.layer, sign_of(row.signs, side))
-                doses = row.doses if row.kind == "void" else row.doses[-1:]
-                cells |= {(*along, *combination) for combination in product(steering.direction_regimes, doses)}
+                cells |= {
+                    (*along, *combination)
+                    for combination in product(steering.direction_regimes, _doses_of(row.kind, row.doses))
+                }
     answers = Counter[str]()
     for cell in cells:
         source, taxonomy = str(cell[2]), taxonomy_of(str(cell[0]))
@@ -273,8 +274,7 @@ def collect_steered(
 ) -> Iterator[tuple[SteeringCell, StageOutput]]:
     """Generate the missing answers; yield the STEERING rows of each finished cell.
 
-    directions: by VQA prompt, then by source. Several processes may run it at once: one writes the answers of an
-    evaluation, and the others generate answers meanwhile (`shared_answers`).
+    directions: by VQA prompt, then by source. One process at a time writes the answers of an evaluation.
     """
     vectors = {
         vector_digest(vector): vector
@@ -285,42 +285,18 @@ def collect_steered(
         for vector in draw
     }
 
-    store = SharedAnswers(workspace.store, workspace.ledger_folder / "made" / entry.id, entry.limits.concurrency)
-
     def calls(cell: SteeringCell) -> list[SteeredQuestion]:
-        questions = wanted_steered(workspace, entry, cell, directions[cell.directions])
-        store.chunks([question.request for question in questions])
-        return questions
+        return wanted_steered(workspace, entry, cell, directions[cell.directions])
 
     def finish(settled: SettledCell[SteeringCell, SteeredQuestion]) -> tuple[SteeringCell, StageOutput]:
-        store.forget([call.request for call in settled.calls])
         answers = settled.answered()
         unsteered_texts = {q.item["item_id"]: row["text"] for q, row in answers if q.strength.kind == UNSTEERED}
         return settled.output(partial(_steering_row, unsteered_texts))
 
     def make(entry: Entry) -> SteeredBackend:
-        return SteeredBackend(entry, vectors, store)
+        return SteeredBackend(entry, vectors)
 
-    for cell in cells:
-        if is_written(workspace.answers, cell.evaluation.key):
-            _make_meanwhile(workspace, cell, calls(cell), store, make(entry))
     yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
-
-
-def _make_meanwhile(
-    workspace: Workspace,
-    cell: SteeringCell,
-    questions: Sequence[SteeredQuestion],
-    shared: SharedAnswers,
-    backend: SteeredBackend,
-) -> None:
-    """Generate answers of a cell while another process writes those of its evaluation."""
-    report = progress.current()
-    report.note(f"{cell.key}: another process writes the answers; some are made here, from the last one on")
-    requests = [question.request for question in questions]
-    tick = partial(report.tick, "steering", f"chunks of answers of {cell.key}")
-    count = make_meanwhile(shared, workspace.answers, cell.evaluation.key, requests, backend.generate, tick)
-    report.note(f"{cell.key}: {count} answers were made for the process that writes them")
 
 
 def _steering_row(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -11,8 +11,11 @@ import pandas as pd
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
-from traps_pipeline.mechanism.probing_versions import states_folder
+from traps_pipeline.mechanism.probing_versions import joined_models, states_folder
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.protocol.cells import Extraction, StatesCell
+from traps_pipeline.protocol.datasets import PROBED_DATASETS
+from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -27,10 +30,22 @@ class StoredStates:
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
         """Return an extraction's states. Raises TrapsError if nothing was extracted."""
-        items = workspace.tables.read_all(HIDDEN_STATES, **extraction.partition)
+        items = workspace.tables.read_all(HIDDEN_STATES, dataset=PROBED_DATASETS, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
         return StoredStates(workspace, extraction, items.reset_index(drop=True))
+
+    @staticmethod
+    def of_random(workspace: Workspace, model: str) -> list[StoredStates]:
+        """Return states of a model's network with random weights, for each seed that was extracted."""
+        entry = get_model(model)
+        extractions = [Extraction(model, name) for name in RANDOM_WEIGHTS if entry.has_random_weights]
+        made = workspace.tables.partitions(HIDDEN_STATES)
+        return [
+            StoredStates.of(workspace, extraction)
+            for extraction in extractions
+            if any(extraction.partition.items() <= part.items() for part in made)
+        ]
 
     @property
     def n_layers(self) -> int:
@@ -42,9 +57,24 @@ class StoredStates:
         """Digest of the items and their states."""
         return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
 
+    @property
+    def joined(self) -> dict[str, Any]:
+        """Values of the columns of rows that join these states with answers."""
+        entry = get_model(self.extraction.model)
+        return {**self.extraction.partition, "joins": joined_models(entry, self.workspace.mechanism)}
+
     def dataset(self, name: str) -> pd.DataFrame:
         """Return the rows of a dataset."""
         return self.items.loc[self.items["dataset"] == name]
+
+    def read_as(self, order: StoredStates, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
+        """Return states as `read`, in the order of another extraction's items."""
+        places = pd.Index(self.dataset(dataset)["item_id"]).get_indexer(pd.Index(order.dataset(dataset)["item_id"]))
+        if (places < 0).any():
+            raise TrapsError(
+                f"{self.extraction.key} lacks states of items of {dataset}; materialize hidden_states again"
+            )
+        return self.read(dataset, layer)[places]
 
     def read(self, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
         """Return states (n, d) float32 in the order of the rows.

@@ -30,7 +30,7 @@ TRANSFER_PAIRS = tuple(permutations(DATASETS, 2))  # the twelve ordered pairs of
 # Analyses of probes that have a value at every layer (`probing`); they are part of the version of probes.
 CURVES = (
     *("transfer", "held_out", "confabulated", "confabulated_held_out", "within", "shuffled"),
-    *("answerable_void", "answerable_control", "time_swapped"),
+    *("answerable_void", "answerable_control"),
 )
 
 # Items that can be answered although they look like voids, and the dataset whose voids they look like.

@@ -61,7 +61,7 @@ class Request:
 
     @cached_property
     def key(self) -> str:
-        """The ledger key."""
+        """The ledger key: a digest of all that the answer depends on."""
         return digest(self.components)
 
 

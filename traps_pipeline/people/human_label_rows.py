@@ -61,7 +61,7 @@ class HumanAgreementRow:
     n_shared: Annotated[int, "of these, labelled by two people or more"]
     agreement: Annotated[float | None, "share of pairs of labels of the same unit that are equal; null without any"]
     alpha: Annotated[float | None, "Krippendorff's alpha (nominal) over n_shared"]
-    undefined: Annotated[str | None, "why a figure is null"]
+    undefined: Annotated[str | None, "why a statistic is null"]
     seconds: Annotated[float, "median seconds a label"]
 
 

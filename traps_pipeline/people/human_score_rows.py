@@ -48,7 +48,7 @@ class PanelErrorsRow:
     specificity: Annotated[
         float | None, "share of people's no that the panel says too, strata weighted; null if none", CI
     ]
-    undefined: Annotated[str | None, "why figures cannot be corrected for it"]
+    undefined: Annotated[str | None, "why metrics cannot be corrected for it"]
     panel: shared.Panel
 
 

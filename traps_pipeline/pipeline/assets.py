@@ -79,7 +79,8 @@ def _observable(source: Source) -> dg.AssetsDefinition:
 
 def _asset(graph: Graph, stage: Stage) -> dg.AssetsDefinition:
     key, partitions = asset_key(stage.name), partitions_of(stage.scheme) if stage.scheme else None
-    checks = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc, check.blocks) for check in stage.checks)]
+    docs = [(check, "" if check.blocks else " A failure is a warning and blocks nothing.") for check in stage.checks]
+    checks = [(CURRENT, CURRENT_DOC, False), *((check.name, check.doc + note, check.blocks) for check, note in docs)]
 
     @dg.asset(
         key=key,

@@ -26,7 +26,7 @@ from traps_pipeline.pipeline.assets import WorkspaceResource
 from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.machine import require_machine
-from traps_pipeline.pipeline.metadata import errors_for_pages, visible_metadata
+from traps_pipeline.pipeline.metadata import errors_for_pages, page_text, visible_metadata
 from traps_pipeline.pipeline.partition_checks import CURRENT
 from traps_pipeline.pipeline.ranges import batches
 from traps_pipeline.pipeline.run import materialize_stale
@@ -93,8 +93,10 @@ def _job(name: str, doc: str, stages: Sequence[Stage]) -> Any:
             raise
         if runs.finished:
             context.add_output_metadata({"runs": dg.MetadataValue.table([dg.TableRecord(r) for r in runs.finished])})
-        if outcome.problems:
-            raise TrapsError("\n".join(outcome.problems))
+        for warning in outcome.warnings:
+            context.log.warning(warning)
+        if problems := [problem for problem in outcome.problems if problem not in outcome.warnings]:
+            raise TrapsError("\n".join(problems))
 
     @dg.job(name=name, description=doc)
     def job() -> None:
@@ -123,7 +125,8 @@ def report_unseen(instance: dg.DagsterInstance, plan: RunPlan, reported: dict[st
             reasons = [*status.outdated]
             if status.kind == "missing":
                 reasons = (reasons or [_GONE]) if key in recorded_versions else []
-            wrong = reasons[0] + (f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else "") if reasons else ""
+            rest = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+            wrong = page_text(reasons[0] + rest) if reasons else ""  # the pages show it, and the sensor's cursor
             if wrong != reported.get(name_of((stage, key)), ""):
                 changes.append((stage, key, wrong))
     for stage, key, wrong in changes[:MAX_REPORTS]:  # a tick has a minute, and the next one goes on

@@ -1,22 +1,19 @@
 """Speed up Dagster's SQLite storage fourfold by persistent connections.
 
-For each event Dagster makes an engine, which compiles its statements anew, opens and closes the file, and looks up
-which tables and columns there are. Here the engine of a file is kept, and so is what was there. Its commits go to
-SQLite's write-ahead log beside the file, which Dagster's pages do not watch, so each commit that changes something also
-touches the file. `dagster.yaml` names this class; a study may name another storage in its own `dagster.yaml`.
+For each event Dagster makes an engine, which compiles its statements anew, and opens and closes the file. Here the
+engine of a file is kept. Its commits go to SQLite's write-ahead log beside the file, which its pages do not watch,
+so each commit that changes something also touches the file. `dagster.yaml` names this class; a study may name another
+storage in its own `dagster.yaml`. `bench/event_storage.py` compares both: it goes once it no longer pays.
 """
 
 import contextlib
 import os
-import sqlite3
 import threading
 from collections.abc import Iterator
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any, cast
 
 import sqlalchemy as db
-from dagster._core.storage.event_log import AssetKeyTable, SqliteEventLogStorage
+from dagster._core.storage.event_log import SqliteEventLogStorage
 from dagster._core.storage.sqlite_storage import (
     DagsterSqliteStorage,
     SqliteRunStorage,  # pyright: ignore[reportPrivateImportUsage] - a part of the storage, of another module
@@ -25,10 +22,8 @@ from sqlalchemy.event import listen
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from traps_pipeline.base.databases import reason_and_remedy
-from traps_pipeline.base.files import write_bytes
 
 OPEN_FILES = 32  # at most: each run has a file of its own, and a server sees many
-_INDEX = "index"  # the file of all runs' events of assets; each run has another
 _BUSY_S = 30  # wait for another process's lock, as long as Dagster itself
 
 
@@ -75,14 +70,13 @@ class _EventStorage(SqliteEventLogStorage):
     def __init__(self, base_dir: str) -> None:
         self._engines: dict[str, db.Engine] = {}
         self._engines_lock = threading.Lock()  # threads of a web server ask at once
-        self._there: set[str] = set()  # tables, and columns of assets: what is there stays
         super().__init__(base_dir)
 
     @contextlib.contextmanager
     def _connect(self, shard: str) -> Iterator[db.Connection]:
         with self._db_lock:
             if shard not in self._initialized_dbs:
-                self._begin(shard)
+                self._initdb(self._engine(shard))
                 self._initialized_dbs.add(shard)
             engine = self._engine(shard)
             with _transaction(engine) as connection:
@@ -93,19 +87,6 @@ class _EventStorage(SqliteEventLogStorage):
                 with contextlib.suppress(FileNotFoundError):
                     os.utime(self.path_for_shard(shard))
 
-    def _begin(self, shard: str) -> None:
-        """Make a run's file, a copy of the first: Dagster would read all its migrations."""
-        path = Path(self.path_for_shard(shard))
-        empty = path.with_name(f"empty-{version('dagster')}")  # a run's file without events
-        is_new = shard != _INDEX and not path.exists()
-        if is_new and empty.exists():
-            write_bytes(path, empty.read_bytes())
-            return
-        self._initdb(self._engine(shard))
-        if is_new:
-            with contextlib.closing(sqlite3.connect(path)) as connection:
-                write_bytes(empty, connection.serialize())
-
     def _engine(self, shard: str) -> db.Engine:
         with self._engines_lock:
             if shard not in self._engines:
@@ -113,17 +94,6 @@ class _EventStorage(SqliteEventLogStorage):
                     self._engines.pop(next(iter(self._engines))).dispose()
                 self._engines[shard] = _persistent_engine(self.conn_string_for_shard(shard))
             return self._engines[shard]
-
-    def has_table(self, table_name: str) -> bool:
-        if table_name not in self._there and super().has_table(table_name):
-            self._there.add(table_name)
-        return table_name in self._there
-
-    def _has_asset_key_col_on_connection(self, conn: db.Connection, column_name: str) -> bool:
-        column = f"{AssetKeyTable.name}.{column_name}"
-        if column not in self._there and super()._has_asset_key_col_on_connection(conn, column_name):
-            self._there.add(column)
-        return column in self._there
 
     def dispose(self) -> None:
         super().dispose()
@@ -142,7 +112,7 @@ class _RunStorage(SqliteRunStorage):
 
 
 class SqliteStorage(DagsterSqliteStorage):
-    """See the module. base_dir: `$DAGSTER_HOME`."""
+    """Dagster's SQLite storage with connections that are kept. base_dir: `$DAGSTER_HOME`."""
 
     def __init__(self, base_dir: str, inst_data: Any = None) -> None:
         super().__init__(base_dir, inst_data)

@@ -10,15 +10,17 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.suggestions import did_you_mean
+from traps_pipeline.base.suggestions import did_you_mean, nearest
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
+from traps_pipeline.benchmark.corrections import corrected_scenarios, current_benchmark, subset
+from traps_pipeline.benchmark.records import refuse_recorded
 from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
-from traps_pipeline.models.registry.judges import require_panel
+from traps_pipeline.models.registry.judges import load_panel, load_panels, require_panel
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import DATASETS, REPLACED, SCHEMAS, TWO_EVENTS, UNPAIRED
-from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES
+from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES, fields_of
 from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
 EXPERIMENTS = ASSETS / "experiments"
@@ -27,10 +29,7 @@ LITE_FILE = ASSETS / "lite.yaml"
 
 
 class Experiment(Settings):
-    """The fields of an experiment's file.
-
-    benchmark, scenarios, per_family and panel are copied to the study.
-    """
+    """The fields of an experiment's file. benchmark, scenarios, per_family and panel are copied to the study."""
 
     name: Name = Field(pattern=r"^[a-z0-9-]+$", description="of the experiment in `study.yaml`")
     description: str = Field(default="", description="one line, printed when it runs")
@@ -109,6 +108,11 @@ class Experiment(Settings):
         return Study(**{name: value for name, value in values.items() if value is not None})
 
     @property
+    def is_structured(self) -> bool:
+        """Whether a model is asked for an object of a schema, in any of its calls."""
+        return self.canary or any(fields_of(r, d) for r in self.regimes for d in self.datasets)
+
+    @property
     def asked(self) -> Asked:
         """The experiment's datasets, models, regimes and runs, in the study's format."""
         values = {name: tuple(getattr(self, name)) for name in ("datasets", "models", "regimes", "runs")}
@@ -169,6 +173,16 @@ def load_experiment(name: str) -> Experiment:
     with name_file_in_errors(path):
         for model in experiment.models:
             get_model(model)
+        for panel in (*experiment.own.panels, experiment.panel or ""):
+            if nearest(panel, load_panels()):  # another one may be the workspace's own
+                load_panel(panel)
+        if experiment.scenarios is not None and experiment.benchmark == current_benchmark():
+            subset(corrected_scenarios(), experiment.study)
+        if physical := [
+            *(model for model in experiment.models if get_model(model).backend in ("observer", "rule")),
+            *(dataset for dataset in experiment.datasets if dataset in UNPAIRED),
+        ]:
+            refuse_recorded(", ".join(physical))
         for model in experiment.mechanism.models if experiment.mechanism else ():
             if get_model(model).backend != LOCAL:
                 raise TrapsError(

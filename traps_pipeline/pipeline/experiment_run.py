@@ -6,8 +6,10 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base import progress
 from traps_pipeline.base.extras import require
 from traps_pipeline.models.asking.backends import require_libraries
+from traps_pipeline.models.money.spending import open_budget
 from traps_pipeline.models.registry.entries import NETWORK, Entry
 from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.pipeline.experiment import Experiment
@@ -42,7 +44,8 @@ def run_experiment(
     plan = RunPlan(workspace, experiment.name, stages_until(until))
     plan.require_work(until)
     if plan.is_nothing_to_do():
-        return RunReport(plan.failed_checks())
+        warnings = plan.failed_checks(blocking=False)
+        return RunReport(plan.failed_checks() + warnings, warnings)
     from traps_pipeline.pipeline.machine import pending_entries, require_machine
     from traps_pipeline.pipeline.run import dagster_history, materialize_stale
 
@@ -54,8 +57,11 @@ def run_experiment(
             require("local")
         if look_at_machine:
             require_machine(plan)
+        if any(entry.prices for entry in entries):  # from the first line on
+            with open_budget(workspace, entries) as budget:
+                progress.current().money(budget.spent_usd, workspace.study.budget_usd)
         if preflight is not None:
-            _preflight(workspace, entries, preflight, goes_on)
+            _preflight(workspace, experiment, entries, preflight, goes_on)
         with open_runs(instance, workspace) as runs:
             report = materialize_stale(instance, runs, plan)
     if not report.problems:
@@ -68,7 +74,11 @@ def run_experiment(
 
 
 def _preflight(
-    workspace: Workspace, entries: Sequence[Entry], say: Callable[[str], None], goes_on: Callable[[str], bool]
+    workspace: Workspace,
+    experiment: Experiment,
+    entries: Sequence[Entry],
+    say: Callable[[str], None],
+    goes_on: Callable[[str], bool],
 ) -> None:
     """Try networked models and judges first. Raises TrapsError with all problems."""
     network = [entry for entry in entries if entry.backend == NETWORK]
@@ -78,7 +88,7 @@ def _preflight(
     models = [entry for entry in network if entry not in judges]
     from traps_pipeline.checks.live_check import preflight, require_sound
 
-    checks = preflight(workspace, models, judges)
+    checks = preflight(workspace, models, judges, structured=experiment.is_structured)
     for check in checks:
         if not check.problems:  # they are raised instead
             say(check.line)

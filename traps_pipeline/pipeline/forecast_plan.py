@@ -13,7 +13,7 @@ from traps_pipeline.judging.confabulation import sample_failures
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import tasks_for, vote_requests
-from traps_pipeline.mechanism.cost import CARDS, Cost, Work, cost_of, mechanism_passes
+from traps_pipeline.mechanism.cost import CARDS, RANDOM, ROWS_BEHIND, Cost, Work, cost_of, mechanism_passes
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.probing_versions import mechanism_entry
 from traps_pipeline.mechanism.steering import count_answers
@@ -164,15 +164,18 @@ def _local_costs(
             inside_entry, params = mechanism_entry(entry, settings), entry.inside_params()
             parts = plan.workspace.tables.partitions(HIDDEN_STATES) if plan else []
             if not any(part["model"] == model for part in parts):
-                passes_of_all = mechanism_passes(settings, experiment.datasets, taxonomies)
+                passes_of_all = mechanism_passes(settings, experiment.datasets, taxonomies, entry.has_random_weights)
                 work += [(inside_entry, passes, params) for passes in passes_of_all]
             if settings.steering and model in steered:
                 max_tokens = min(entry.expected_completion_tokens, settings.steering.max_new_tokens)
-                work.append((inside_entry, Work("steered answers", steered[model][0].new, max_tokens), params))
+                answers = steered[model][0].new
+                work.append((inside_entry, Work("steered answers", answers, max_tokens), params))
+                work.append((inside_entry, Work("their perplexity", answers / ROWS_BEHIND), params))
         for media, passes, params in work:
             assert media.media is not None, "local entries have media"
             if passes.passes:
-                yield cost_of(media, media.media, passes, CARDS[card], quantised=params.quantisation == "nf4")
+                is_quantised = params.quantisation == "nf4" and passes.kind != RANDOM
+                yield cost_of(media, media.media, passes, CARDS[card], quantised=is_quantised)
 
 
 def _count_labels(plan: RunPlan | None, experiment: Experiment, judge: JudgeEntry) -> Count:

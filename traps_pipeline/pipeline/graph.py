@@ -172,7 +172,7 @@ class Graph:
 
     @cached_property
     def sources(self) -> list[str]:
-        """Names of all sources."""
+        """Names of all sources: files that people edit and stages read."""
         return [name for name, declaration in self.declared.items() if isinstance(declaration, Source)]
 
     def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:

@@ -66,10 +66,7 @@ class _Once(Generic[Value]):
 
 
 class Lineage:
-    """A snapshot of a workspace that looks each version up once.
-
-    thorough: read every table in full.
-    """
+    """A snapshot of a workspace that looks each version up once. thorough: read every table in full."""
 
     def __init__(self, workspace: Workspace, graph: Graph | None = None, *, thorough: bool = False) -> None:
         self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough

@@ -64,7 +64,7 @@ def require_machine(plan: RunPlan, parts: Parts | None = None) -> None:
 
 
 def pending_entries(plan: RunPlan, parts: Parts) -> list[Entry]:
-    """Return the models and judges, but for reference models, of cells whose answers or votes are missing."""
+    """Return the models and judges, but for reference strategies, of cells whose answers or votes are missing."""
     pending, panel = dict[tuple[type[Entry], str], Entry](), plan.workspace.study.panel
     for name, keys in parts.items():
         stage = plan.graph[name]

@@ -21,6 +21,7 @@ from traps_pipeline.storage.tables import Table
 from traps_pipeline.storage.workspace import Workspace
 
 PREVIEWED, SHORT = 5, 24  # rows, and characters of a text that is shown in them
+BEGINNINGS = {"text": 60}  # characters of columns of which only the beginning is shown
 WORDS = {"asked": "asked", "cached": "known", "errors": "failed", "frames": "frames"}  # of a tally's counts
 RANKED = ("pecs", "conjunction")  # columns by which the rows of a table are better or worse
 
@@ -102,7 +103,7 @@ def partition_metadata(workspace: Workspace, stage: Stage, key: str | None, outp
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:
     """Return a preview: best and worst rows of a ranked table, else the first rows.
 
-    Columns that do not differ and long texts are left out.
+    Columns that do not differ and long texts are left out, but for the beginnings of answers.
     """
     import pandas as pd
 
@@ -121,7 +122,10 @@ def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValu
             "first rows": first.to_dict("records") if hasattr(content, "head") else [asdict(row) for row in first]
         }
     preview_rows = [row for rows in samples.values() for row in rows]
-    shown_columns = [c.name for c in table.columns if _is_telling(c.type, [row.get(c.name) for row in preview_rows])]
+    for row in preview_rows:
+        row |= {name: row[name][:most] for name, most in BEGINNINGS.items() if isinstance(row.get(name), str)}
+    columns = [(column, [row.get(column.name) for row in preview_rows]) for column in table.columns]
+    shown_columns = [c.name for c, values in columns if c.name in BEGINNINGS or _is_telling(c.type, values)]
     names = [*table.key, *([rank_column] if rank_column else []), *shown_columns]
     names = [name for name in dict.fromkeys(names) if name not in table.partition_by]
     tables = {

@@ -10,7 +10,7 @@ import dagster as dg
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.money.budget import BudgetReached
-from traps_pipeline.pipeline.graph import Graph, Node, Stage, name_of
+from traps_pipeline.pipeline.graph import Graph, Node, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import Lineage, failed_calls
 from traps_pipeline.pipeline.metadata import visible_metadata
@@ -103,7 +103,7 @@ class StageChecks:
 
 
 def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) -> None:
-    """Raise TrapsError, or BudgetReached, for all failures of this run, up to a stage.
+    """Raise TrapsError, or BudgetReached, for all failures of this run that block something, up to a stage.
 
     An error in an upstream step would have made Dagster skip everything downstream, including what is sound.
     """
@@ -112,7 +112,7 @@ def raise_for_run(context: dg.AssetExecutionContext, graph: Graph, last: str) ->
     for entry in context.instance.all_logs(context.run.run_id, of_type=event_type):
         event = entry.get_dagster_event().asset_check_evaluation_data
         node = (event.asset_key.path[-1], event.partition)
-        if node[0] in upstream and STILL not in event.metadata:
+        if node[0] in upstream and STILL not in event.metadata and event.severity == dg.AssetCheckSeverity.ERROR:
             failed[event.check_name, node] = event
     messages_by_reason: dict[tuple[str, str], list[str]] = {}  # by stage and message: each reason is reported once
     for (check, node), event in failed.items():
@@ -133,11 +133,13 @@ def evaluations(
 ) -> Iterator[dg.AssetCheckEvaluation]:
     """Yield the evaluation of each check of a partition, from the checks' failures."""
     target = history.check_target(stage, key)
+    warning_checks = {check.name for check in the_graph()[stage].checks if not check.blocks}
     for check, failure in found.items():
         yield dg.AssetCheckEvaluation(
             asset_key=asset_key(stage),
             check_name=check,
             passed=not failure,
+            severity=dg.AssetCheckSeverity.WARN if check in warning_checks else dg.AssetCheckSeverity.ERROR,
             partition=key,
             metadata=visible_metadata(failure),
             target_materialization_data=target,

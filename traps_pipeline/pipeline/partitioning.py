@@ -11,6 +11,8 @@ from functools import cached_property
 from itertools import product
 from typing import Any, Protocol
 
+from typing_extensions import override
+
 from traps_pipeline.pipeline.wanted import StudyPartitions
 
 SEPARATOR = "|"  # between the two dimensions of a key, as Dagster writes it
@@ -30,7 +32,7 @@ class Partitioning:
 
     @cached_property
     def keys(self) -> Sequence[str]:
-        """All keys, in order."""
+        """The partition keys of all dimensions, in Dagster's order."""
         return [*map(SEPARATOR.join, product(*self.dimensions.values()))]
 
     @cached_property
@@ -62,20 +64,20 @@ class KeyMapping(Protocol):
 
 
 @dataclass(frozen=True)
-class Every:
+class Every(KeyMapping):
     """All partitions of the parent."""
 
+    @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
-        """See `KeyMapping`."""
         return above.keys
 
 
 @dataclass(frozen=True)
-class SameKeys:
+class SameKeys(KeyMapping):
     """The partition of the same key."""
 
+    @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
-        """See `KeyMapping`."""
         return [key] if key in above.known and key is not None else []
 
 
@@ -83,13 +85,13 @@ EVERY, SAME = Every(), SameKeys()
 
 
 @dataclass(frozen=True)
-class ByDimension:
+class ByDimension(KeyMapping):
     """Partitions that agree in one dimension; one side has only that, the other two."""
 
     name: str
 
+    @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
-        """See `KeyMapping`."""
         assert key is not None and below is not None, "both sides have partitions"
         if len(above.dimensions) == 1:
             return [key.split(SEPARATOR)[[*below.dimensions].index(self.name)]]
@@ -98,22 +100,22 @@ class ByDimension:
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class Pairs(KeyMapping):
     """Partitions listed one by one: the downstream keys of each parent partition."""
 
     below: Mapping[str, Sequence[str]]
 
+    @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
-        """See `KeyMapping`."""
         return [parent for parent, keys in self.below.items() if key in keys]
 
 
 @dataclass(frozen=True)
-class FixedKeys:
+class FixedKeys(KeyMapping):
     """The same partitions of the parent for every key."""
 
     keys: Sequence[str]
 
+    @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
-        """See `KeyMapping`."""
         return self.keys

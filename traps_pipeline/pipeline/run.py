@@ -126,6 +126,7 @@ def materialize_stale(instance: dg.DagsterInstance, runs: Runs, plan: RunPlan) -
                 report.problems += range_outcome.problems
                 report.over_budget |= range_outcome.over_budget
             plan.renew(pending)
-    report.problems = [*dict.fromkeys([*report.problems, *plan.failed_checks()])]
+    report.warnings = plan.failed_checks(blocking=False)
+    report.problems = [*dict.fromkeys([*report.problems, *plan.failed_checks(), *report.warnings])]
     report.seconds, report.tallies = time.monotonic() - started_at, progress.current().totals
     return report

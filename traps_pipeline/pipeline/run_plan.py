@@ -62,11 +62,12 @@ class StageStatus:
 class RunReport:
     """A run's problems in sentences, whether a budget ended it, and its tallies.
 
-    is_made: whether every table is made, so that the same command would do nothing; has_board: whether the leaderboard
-    is.
+    warnings: those of them that block nothing. is_made: whether every table is made, so that the same command would do
+    nothing; has_board: whether the leaderboard is.
     """
 
     problems: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     is_made: bool = True
     has_board: bool = True
     over_budget: bool = False
@@ -79,7 +80,7 @@ class RunReport:
 
     @property
     def frames(self) -> int:
-        """Number of rendered frames."""
+        """How many frames the run rendered."""
         return sum(tally.frames for tally in self.tallies.values())
 
 
@@ -171,13 +172,14 @@ class RunPlan:
                 f"--until {', '.join(empty)}: experiment {self.experiment} wants nothing of it; name another stage"
             )
 
-    def failed_checks(self) -> list[str]:
-        """Return failed checks of wanted partitions, from this or any earlier run."""
+    def failed_checks(self, *, blocking: bool = True) -> list[str]:
+        """Return failed checks of wanted partitions, from any run; those that block something, or the others."""
         failing, problems = {stage for _, stage, _, _ in failing_checks(self.workspace)}, list[str]()
         for stage in (stage for stage in self.graph.stages if stage.name in failing):
             checks = self.workspace.failed_checks(stage.name)
+            blocks = {check.name: check.blocks for check in stage.checks}
             for key in stage.wanted(self.partitions):
-                for check in checks.get(key, ()):
+                for check in (name for name in checks.get(key, ()) if blocks.get(name, True) == blocking):
                     details = self.workspace.failure(stage.name, check, key)
                     details = details[1:-1] if details[:1] == details[-1:] == '"' else details
                     problems.append(f"check {check} of {name_of((stage.name, key))} does not pass: {details}")

@@ -26,6 +26,7 @@ from traps_pipeline.pipeline.ranges import Range, batches
 from traps_pipeline.pipeline.translation import asset_key
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
+JOB_TAG = "traps/job"
 PARENT_TAG, ROOT_TAG = "dagster/parent_run_id", "dagster/root_run_id"
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
 # Errors whose message is for people; the last one's class is imported only if SQLite holds the history.
@@ -69,11 +70,12 @@ class LocalRuns(Runs):
     ) -> None:
         self._instance, self._job, self._parent, self._log = instance, job, parent, log
         ids = {PARENT_TAG: parent.run_id, ROOT_TAG: parent.root_run_id or parent.run_id} if parent else {}
+        ids |= {JOB_TAG: parent.job_name} if parent else {}  # Dagster's pages call a run with a parent a re-execution
         self._tags = {PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **ids}
         self.finished: list[dict[str, str]] = []
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
-        """See `Runs`: the fewest ranges that contain exactly these keys."""
+        """Return the fewest ranges of keys that contain exactly these keys."""
         return [*batches(stages[0].scheme if stages else None, keys)]
 
     @override

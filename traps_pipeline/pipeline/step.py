@@ -46,10 +46,7 @@ _PLANS: dict[str, RunPlan] = {}  # by run: its snapshot of the study; only of th
 
 
 def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspace) -> Events:
-    """Build this run's part of a stage; yield Dagster's events.
-
-    Raises TrapsError for all failures at the run's end.
-    """
+    """Build this run's part of a stage; yield Dagster's events. Raises TrapsError for all failures at the run's end."""
     step = _Step(stage, context, workspace)
     yield from step.tell_unwanted()
     for key in step.to_make():

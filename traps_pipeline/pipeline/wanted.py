@@ -20,11 +20,10 @@ from traps_pipeline.protocol.datasets import (
     DATASETS,
     PROBED_ARMS,
     PROBED_DATASETS,
-    TIME_SWAPPED,
     UNPAIRED,
     all_datasets_of,
 )
-from traps_pipeline.protocol.regimes import PROBE_PROMPT, REGIMES, VQA_PROMPTS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, RANDOM_WEIGHTS, REGIMES, VQA_PROMPTS
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
@@ -124,7 +123,7 @@ class StudyPartitions:
 
     @cached_property
     def steers(self) -> bool:
-        """Whether models are steered."""
+        """Whether any experiment of the study steers models."""
         return self._mechanism is not None and (self._mechanism[1] is None or self._mechanism[1].steering is not None)
 
     @cached_property
@@ -148,9 +147,7 @@ class StudyPartitions:
         datasets = self._mechanism[0] if self._mechanism else []
         asked_datasets = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
         existing = {*datasets, *(arm for arm in PROBED_ARMS if self._mechanism and arm in asked_datasets)}
-        existing |= {
-            dataset for dataset, origin in ((ANSWERABLE, "occlusion"), (TIME_SWAPPED, "chaotic")) if origin in existing
-        }
+        existing |= {ANSWERABLE} if "occlusion" in existing else set()
         return [d for d in PROBED_DATASETS if d in existing]
 
     @cached_property
@@ -160,19 +157,24 @@ class StudyPartitions:
             return []
         settings = self._mechanism[1]
         models = local_models() if settings is None else [*settings.models]
-        return [Extraction(model, p) for model in models for p in (settings.prompts if settings else VQA_PROMPTS)]
+        prompts = settings.prompts if settings else VQA_PROMPTS
+        return [
+            Extraction(model, prompt)
+            for model in models
+            for prompt in (*prompts, *(RANDOM_WEIGHTS if get_model(model).has_random_weights else ()))
+        ]
 
     @cached_property
     def states(self) -> list[str]:
         """Keys of hidden_states; datasets that are no pairs serve only probes."""
         cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
-        return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt == PROBE_PROMPT]
+        return [c.key for c in cells if c.dataset in DATASETS or c.extraction.text == PROBE_PROMPT]
 
     @cached_property
     def probed_prompts(self) -> tuple[str, ...]:
-        """VQA prompts whose states probes are fitted on."""
+        """VQA prompts whose states probes are fitted on, and extractions of random weights."""
         settings = self._mechanism[1] if self._mechanism else None
-        return settings.probes.prompts if settings else (PROBE_PROMPT,)
+        return (*(settings.probes.prompts if settings else (PROBE_PROMPT,)), *RANDOM_WEIGHTS)
 
     @cached_property
     def steered(self) -> list[str]:

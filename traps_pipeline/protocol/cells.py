@@ -11,7 +11,7 @@ from typing import Any
 
 from traps_pipeline.base.names import check_name
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, UNPAIRED
-from traps_pipeline.protocol.regimes import REGIMES, VQA_PROMPTS
+from traps_pipeline.protocol.regimes import PROBE_PROMPT, RANDOM_WEIGHTS, REGIMES, VQA_PROMPTS
 
 _EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][0-9]*)")
 
@@ -72,10 +72,23 @@ class Cell:
 
 @dataclass(frozen=True, order=True)
 class Extraction:
-    """One local model under one VQA prompt: the partition of probes and directions."""
+    """One local model under one VQA prompt: the partition of probes and directions.
+
+    prompt: of VQA_PROMPTS; or a key of RANDOM_WEIGHTS, which names other weights under PROBE_PROMPT.
+    """
 
     model: str
     prompt: str
+
+    @property
+    def text(self) -> str:
+        """The VQA prompt that is read."""
+        return PROBE_PROMPT if self.prompt in RANDOM_WEIGHTS else self.prompt
+
+    @property
+    def weights_seed(self) -> int | None:
+        """The seed of random weights; None for the checkpoint's own."""
+        return RANDOM_WEIGHTS.get(self.prompt)
 
     @property
     def key(self) -> str:
@@ -91,8 +104,10 @@ class Extraction:
     def parse(key: str) -> Extraction:
         """Parse an extraction's key. Raises ValueError that says what is wrong."""
         model, _, prompt = key.partition("__")
-        if prompt not in VQA_PROMPTS:
-            raise ValueError(f"extraction key {key!r} is not model__prompt with a prompt of {VQA_PROMPTS}")
+        if prompt not in (*VQA_PROMPTS, *RANDOM_WEIGHTS):
+            raise ValueError(
+                f"extraction key {key!r} is not model__prompt with a prompt of {(*VQA_PROMPTS, *RANDOM_WEIGHTS)}"
+            )
         return Extraction(check_name(model), prompt)
 
 

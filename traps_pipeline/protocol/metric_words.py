@@ -37,7 +37,7 @@ class Metric:
 
     @property
     def unit(self) -> Literal["percent", "fraction"]:
-        """How it is printed."""
+        """How the number is printed: as a percentage or a fraction."""
         return "percent" if self.is_share else "fraction"
 
     def ends(self, acc: np.ndarray, false_abs: np.ndarray, abs_rec: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -96,35 +96,46 @@ class Count:
     is_broken: bool = False
     """Whether these answers say nothing: a model that gives too many of them is marked."""
     is_of_decisions: bool = False
+    participle: str = ""
+    """What these answers were, in a sentence on a study of which much is missing."""
+    remedy: str = ""
 
 
+_AT_SERVER = "look at the chat template and the sampling of its server"
 COUNT_WORDS: Mapping[str, Count] = {
     count.name: count
     for count in (
-        Count("n_refused", "Refused", "items that the model or its provider refused", ("refused",)),
-        Count("n_empty", "Empty", "items answered with no text", ("empty",), is_broken=True),
+        Count("n_refused", "Refused", "items that the model or its provider refused", ("refused",),
+            participle="refused", remedy="ask its provider what it refuses",
+        ),
+        Count("n_empty", "Empty", "items answered with no text", ("empty",), is_broken=True, participle="empty",
+            remedy=_AT_SERVER,
+        ),
         Count(
             "n_truncated", "Cut off", "items whose text reached the limit of tokens before an answer", ("truncated",),
-            is_broken=True,
+            is_broken=True, participle="cut off", remedy="raise its limit of tokens (max_tokens)",
         ),
         Count(
             "n_unfinished", "Unfinished",
             "items whose answer ended for an unknown reason (column finish_reason of the answers)", ("unfinished",),
-            is_broken=True,
+            is_broken=True, participle="unfinished", remedy=_AT_SERVER,
         ),
         Count(
             "n_degenerate", "Degenerate",
             "items answered with punctuation alone or with a text that repeats itself, which no judge takes for an "
             "abstention", ("degenerate",),
-            is_broken=True,
+            is_broken=True, participle="degenerate", remedy=_AT_SERVER,
         ),
         Count(
             "n_unread", "Unread",
             "items answered with a text in a form that the rule judges do not read, neither abstentions nor correct",
             ("unread",),
-            is_broken=True,
+            is_broken=True, participle="unread", remedy="let language models judge (panel)",
         ),
-        Count("n_errors", "", "items whose call failed", ("error", "malformed")),
+        Count(
+            "n_errors", "", "items whose call failed", ("error", "malformed"), participle="not given, as calls failed",
+            remedy="mend its server and run the same command again",
+        ),
         Count(
             "n_not_json", "Not JSON",
             "items of the JSON regime whose text is not the object that the prompt asks for; they are judged as they "

@@ -54,6 +54,8 @@ VQA_PROMPTS = tuple(name for name, regime in BY_NAME.items() if regime.states)
 # The paper compares answers under these two: the plain prompt, and the one that permits an abstention.
 STANDARD, GUIDED = PROMPTING = ("standard", "guided")
 PROBE_PROMPT = STANDARD  # probes are of this VQA prompt, the other one serves directions (docs/spec.md 7.1)
+# Extractions under PROBE_PROMPT of the same network with random weights, by seed: controls of claims about states.
+RANDOM_WEIGHTS = {"random_0": 0, "random_1": 1}
 
 
 def fields_of(regime: str, dataset: str = "") -> tuple[str, ...] | None:

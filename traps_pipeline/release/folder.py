@@ -15,11 +15,11 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_folder, write_bytes, write_text
 from traps_pipeline.base.paths import ASSETS, OWN_SPECS, ROOT, SCENE_SPECS
 from traps_pipeline.benchmark.held_out import (
+    begin_publication,
     drawn_items,
     held_out_key,
     mark_held_out,
     opaque,
-    refuse_held_out,
     require_secret_seed,
 )
 from traps_pipeline.release import content as rows_of
@@ -46,6 +46,9 @@ FORMAT = 1  # version of the released folder's format
 MANIFEST, COMMITMENT, CROISSANT = "release.json", "commitment.json", "croissant.json"
 CARD, DICTIONARY, CITATION = "README.md", "DICTIONARY.md", "CITATION.cff"
 LICENCE, PROMPTS_LICENCE = "LICENSE-DATA", "LICENSE-PROMPTS"
+RECORDED_LICENCE = (
+    "Clips and words of each pair: as its importer states in the columns source, licence of metadata.jsonl."
+)
 # The hub's loader finds clips only below their table's folder: pairs name them from the top, items from clips/.
 PLACES: Mapping[str, str] = {
     PAIRS.name: "metadata.jsonl",
@@ -103,11 +106,12 @@ class _Folder:
 
 def write_release(content: Content, target: Path, options: Options) -> ReleaseSummary:
     """Write the folder; it may replace only a former release. Raises TrapsError."""
-    if options.held_out is not None and options.held_out.is_relative_to(target):  # before removing a former release
+    # Before a former release is removed.
+    if options.held_out is not None and options.held_out.resolve().is_relative_to(target.resolve()):
         raise TrapsError(f"{options.held_out}: lies in the folder that is published; keep the key elsewhere")
     _require_own(target)
     if options.held_out is None:
-        refuse_held_out(content.study, "an open release")
+        begin_publication(content.study, "an open release")
     with replace_folder(target) as part:
         folder = _Folder(part, anonymize if options.anonymous else str)
         answers = _open_release(folder, content) if options.held_out is None else None
@@ -170,7 +174,8 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
     tables = [table for table in (OPEN if options.held_out is None else HELD_OUT) if table.name in folder.rows]
     licence = (ROOT / LICENCE).read_text(encoding="utf-8")
     prompts = (ASSETS / "prompts" / "README.md").read_text(encoding="utf-8")
-    folder.text(LICENCE, f"{licence.rstrip()}\n\n{canary}\n")
+    licence = RECORDED_LICENCE if content.people else licence.rstrip()
+    folder.text(LICENCE, f"{licence}\n\n{canary}\n")
     folder.text(PROMPTS_LICENCE, f"{prompts.rstrip()}\n\n{canary}\n")
     citation = yaml.safe_dump(ANONYMOUS_CITATION) if options.anonymous else (ROOT / CITATION).read_text("utf-8")
     folder.text(CITATION, f"# {canary}\n{citation}")
@@ -194,7 +199,8 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
 
 def _description(content: Content) -> dict[str, Any]:
     """Return name, version and canary of the release, and the version of each dataset."""
-    return {**content.release.model_dump(), "versions": content.versions}
+    recorded = {"recorded": True} if content.people else {}
+    return {**content.release.model_dump(), "versions": content.versions, **recorded}
 
 
 # --- double-blind review ----------------------------------------------------------------------------------------------

@@ -33,6 +33,8 @@ class PairRow:
     answer_type: AnswerType
     ground_truth: Annotated[str, "the right answer to the control; the right answer to the void is to abstain"]
     lite: Lite
+    source: Annotated[str, "where the clips are from: simulated, or what the importer of a recorded pair states"]
+    licence: Annotated[str, "of the clips; SPDX id, or what the importer of a recorded pair states"]
     benchmark_version: shared.BenchmarkVersion
     canary: Canary
 
@@ -42,7 +44,7 @@ PAIRS = Table("pairs", PairRow, partition_by=(), key=("pair_id",))
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedItemRow(ItemRow):
-    """What a model is asked about one clip; items of arms have an arm as dataset."""
+    """A question about one clip as it is released; items of arms have an arm as dataset."""
 
     file_name: Annotated[str, "mp4, relative to this table's folder"]
     lite: Lite

@@ -29,7 +29,7 @@ from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.workspace import Workspace
 
 HUB, EVER, PARQUET = "eval_results", "data", "leaderboard.parquet"
-OWN_DEVELOPER = "traps-pipeline"  # developer of the reference models
+OWN_DEVELOPER = "traps-pipeline"  # developer of the reference strategies
 EVER_SCHEMA = "0.3.0"  # schema version of Every Eval Ever
 _REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
 _UNKNOWN = {"deployment_type": "unknown", "model_availability": "unknown"}
@@ -38,13 +38,13 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Attribution:
-    """The evaluating organization, and the developer of all but reference models."""
+    """The evaluating organization, and the developer of all but reference strategies."""
 
     organization: str = "unknown"
     developer: str = "unknown"
 
     def developer_of(self, model: str) -> str:
-        """Return a model's developer."""
+        """Return the organization that made a model."""
         return OWN_DEVELOPER if is_reference(model) else self.developer
 
 

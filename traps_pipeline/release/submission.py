@@ -24,7 +24,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import explain
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
@@ -66,7 +66,7 @@ class SubmittedJudge(_Strict):
 
 
 class About(_Strict):
-    """The contents of `submission.json`.
+    """What a submission says of itself: the contents of `submission.json`.
 
     panel: name of the panel. prompts: version of each regime's. versions: code versions of the tables. files:
     SHA-256 of each table.
@@ -86,10 +86,7 @@ class About(_Strict):
 
 @dataclass(frozen=True)
 class Submission:
-    """A submission in memory.
-
-    altered: tables whose digest differs from `about`.
-    """
+    """A submission in memory. altered: tables whose digest differs from `about`."""
 
     path: Path
     about: About
@@ -105,11 +102,8 @@ class Submission:
 
 
 def pack(workspace: Workspace, target: Path, name: str) -> About:
-    """Write a study's submission, equal bytes for equal studies.
-
-    Raises TrapsError if it is not judged or scored yet.
-    """
-    refuse_held_out(workspace.root, "a submission")
+    """Write a study's submission, equal bytes for equal studies. Raises TrapsError unless it is judged and scored."""
+    begin_publication(workspace.root, "a submission")
     study = workspace.study
     frames = {
         "items.parquet": workspace.tables.read_all(ITEMS, dataset=SUBMITTED_DATASETS),

@@ -36,7 +36,7 @@ class AcceptedSubmission:
 
     @property
     def name(self) -> str:
-        """The submission's own name."""
+        """The name under which the submission ranks."""
         return self.submission.about.name
 
     @property

@@ -242,7 +242,7 @@ def _wrong_panel(submission: Submission, votes: Sequence[Row]) -> Iterator[str]:
     if {seat.backend for seat in description.judges} != {"api"} and not description.judged_by_rules:
         for model in sorted({row["model"] for row in votes}):
             if not is_reference(model):
-                yield f"model {model!r:.100}: rules judged it, which are made for reference models, and nobody says so"
+                yield f"model {model!r:.100}: rules judged it, made for reference strategies, and nobody says so"
     for judge in sorted({row["judge"] for row in votes} - {seat.id for seat in description.judges}):
         yield f"judge {judge!r:.100}: sits in no panel of the submission"
     rules = [seat for seat in description.judges if seat.backend == RULE]

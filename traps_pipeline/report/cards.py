@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import traceback
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
+from traps_pipeline.base import progress
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.explorer_link import EXPLORER, answers_view
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.report.catalogue import FigureReport, TableReport
@@ -58,7 +61,7 @@ class Card:
 
     @property
     def data(self) -> bytes:
-        """The card as JSON."""
+        """The card as JSON, from which `read` makes it again."""
         return json.dumps(asdict(self)).encode()
 
 
@@ -87,7 +90,13 @@ def explorer_address(behind: SourceItems) -> str:
 
 def table_card(report: TableReport, sources: Sources, address: Address | None = explorer_address) -> Card:
     """Return the card of a study's tables."""
-    name, tables = _name(report), report.tables(sources.study)
+    name = _name(report)
+    try:
+        tables = report.tables(sources.study)
+    except TrapsError:
+        raise
+    except Exception as error:  # noqa: BLE001 - one table must not cost the others
+        return Card(name, report.title or report.name, why=_failure(f"table {report.name}", sources, error))
     title = report.title or tables[0].title
     run = [table for table in tables if len(table.rows) or table.none]
     if not run:
@@ -130,13 +139,25 @@ def figure_card(report: FigureReport, sources: Sources) -> Card:
     """Return the card of a study's figure."""
     name = _name(report)
     try:
-        figure = report.figure(sources.study)
+        pictures = {"": _picture(report.name, report.figure(sources.study))}
+        shows = report.note(sources.study)
     except NotRun as reason:
         return Card(name, report.title, why=str(reason))
-    pictures = {"": _picture(report.name, figure)}
-    return Card(
-        name, report.title, _fragment("figures", pictures=pictures, alt=report.title), shows=report.note(sources.study)
-    )
+    except TrapsError:
+        raise
+    except Exception as error:  # noqa: BLE001 - one figure must not cost the others
+        return Card(name, report.title, why=_failure(f"figure {report.name}", sources, error))
+    return Card(name, report.title, _fragment("figures", pictures=pictures, alt=report.title), shows=shows)
+
+
+def _failure(what: str, sources: Sources, error: Exception) -> str:
+    """Note, and return, that a card cannot be made, of which models, and where the code failed."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    models = ", ".join(dict.fromkeys(map(str, sources.study.overall["model"]))) or "no model"
+    message = f"{type(error).__name__} {error}".strip()
+    reason = f"{what} of {models}: cannot be made ({message}, {place.filename.rpartition('/')[2]}:{place.lineno})"
+    progress.current().note(f"{reason}; the rest of the report is written: report it with the tables that it reads")
+    return reason
 
 
 def picture_card(picture: Picture) -> Card:

@@ -28,9 +28,13 @@ RECOMPUTED = "recomputed"  # folder below tables/ for tables computed from the p
 # with the graph.
 JUDGED_STAGES = {
     *("leaderboard", "metrics", "contrasts", "regime_tests", "two_way", "hypotheses", "graded", "leave_one_out"),
-    *("item_scores", "corrected", "gate", "risk_coverage"),
+    *("item_scores", "corrected", "gate"),
     *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs"),
 }
+CLAIM_STAGES = (
+    *("leads", "probes", "probe_baselines", "gate", "item_scores", "sentences", "lens", "patching"),
+    *("cosines", "steering_effects", "steering_nulls"),
+)
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class TableReport:
 
     @property
     def doc(self) -> str:
-        """The caption."""
+        """The table's caption: the docstring of its function."""
         return _caption(self.make)
 
     @property
@@ -75,7 +79,7 @@ class TableReport:
 
         if not results.is_study and not self.recomputed:
             return []
-        remarks = [results.judged_by] if _is_judged(self.reads) else []
+        remarks = [results.certified, *([results.judged_by] if _is_judged(self.reads) else [])]
         with_columns = ((t, printed_columns(results, t.rows, t.columns)) for t in self.make(results))
         tables = [replace(table, columns=columns, notes=[*remarks, *table.notes]) for table, columns in with_columns]
         return [table for table in tables if results.is_study or table.name in self.recomputed]
@@ -123,7 +127,7 @@ class FigureReport:
 
     @property
     def doc(self) -> str:
-        """The caption."""
+        """The figure's caption: the docstring of its function."""
         return _caption(self.make)
 
     def finding(self, results: Results) -> str:
@@ -196,10 +200,9 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("judge_corrected", "human_tables.judge_corrected", ("panel_errors", "corrected"),
         title="Corrected for judges’ errors"),
     TableReport("judge_validation", "judge_tables.validation", ("judge_validation",), paper=True),
+    TableReport("claims", "claims.claims", CLAIM_STAGES, title="What is claimed of a model"),
     TableReport("probes", "probe_tables.probes", ("probes", "probe_baselines"), paper=True,
         recomputed=("probe_means",), title="Probes"),
-    TableReport("probe_baselines", "control_reports.probe_baselines", ("probes", "probe_baselines"),
-        title="Probes and their baselines"),
     TableReport("gate", "control_reports.gate", ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
     TableReport("patching", "patching_tables.patching", ("patching",)),
     TableReport("cosines", "steering_tables.cosines", ("cosines",), paper=True,
@@ -209,6 +212,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("steering_controls", "control_reports.steering_nulls", ("steering_nulls", "steering_pecs"),
         title="Steering among its controls"),
     TableReport("composition", "setup_tables.composition", ("items",), paper=True),
+    TableReport("leaks", "setup_tables.leaks", ("items",), title="What gives recorded voids away"),
     TableReport("models", "setup_tables.models", ("leaderboard",), paper=True),
     TableReport("hyperparameters", "setup_tables.hyperparameters", ("leaderboard", "judge_bias"),
         paper=True),
@@ -230,18 +234,14 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
         frames=("two_way",)),
     FigureReport("graded", "Graded cuts", "graded_figure.graded", ("graded",), published=False),
     FigureReport("confabulation", "Prevalence of confabulation", "grids.confabulation", ("confabulation_prevalence",)),
-    FigureReport("states_and_output", "States against output, item by item", "expression_figures.states_and_output",
-        ("item_scores", "sentences", "probe_baselines"), published=False, has_finding=True),
+    FigureReport("claims", "What is claimed of a model", "expression_figures.claims", CLAIM_STAGES, published=False,
+        has_finding=True),
+    FigureReport("leads", "States among their rivals", "expression_figures.leads", ("leads",), published=False,
+        has_finding=True),
     FigureReport("lens", "The margin by layer", "expression_figures.lens", ("lens",), published=False,
         has_finding=True),
-    FigureReport("probe_baselines", "Probes against their baselines", "control_figures.probe_baselines",
-        ("probes", "probe_baselines"), published=False, has_finding=True),
-    FigureReport("gate_arrows", "Probe-gated abstention", "control_figures.gate_arrows", ("gate", "risk_coverage"),
-        published=False, has_finding=True),
     FigureReport("patching", "Activation patching", "control_figures.patching", ("patching",), published=False,
         has_finding=True),
-    FigureReport("doses_among_nulls", "Doses among nulls", "control_figures.doses_among_nulls",
-        ("steering_effects", "steering_nulls"), published=False, has_finding=True),
     FigureReport("probe_curves", "Probe transfer by layer", "steering_figures.probe_curves", ("probes",),
         published=False),
     FigureReport("confabulated_strip", "Probes on confabulated voids", "steering_figures.confabulated_strip",
@@ -252,7 +252,7 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
 )  # fmt: skip
 
 # Leading figures of a study with mechanistic analyses: the claim, and its possible refutations.
-INSIDE = ("states_and_output", "lens", "probe_baselines", "gate_arrows", "patching", "doses_among_nulls")
+INSIDE = ("claims", "leads", "lens", "patching")
 
 
 def folder(kind: str, results: Results) -> str:

@@ -91,7 +91,8 @@ def six_pairs(items: pd.DataFrame) -> pd.DataFrame:
 
     No two are of one sub-scenario, and their categories differ if possible; fewer if there are fewer sub-scenarios.
     """
-    visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"])]
+    is_whole = items.groupby("pair_id")["side"].transform("nunique") == 2  # a held-out set asks one side of each
+    visual = items.loc[items["dataset"].isin(["occlusion", "chaotic"]) & is_whole]
     pair_ids: list[str] = []
     for _, rows in visual.groupby("taxonomy", sort=True):
         pairs = rows.drop_duplicates("pair_id").sort_values(["category", "sub_scenario", "pair_id"])

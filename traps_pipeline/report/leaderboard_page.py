@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from traps_pipeline.base.terminal import TextTable
+from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.registry.judges import BY_RULES, ONE_JUDGE, is_judged_by_rules
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
@@ -56,6 +57,8 @@ from traps_pipeline.scoring.analyses import null_single_deviations
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 
+LACKING = 0.2  # share of a model's answers without a decision above which a study says so first
+_UNDECIDED = ("undecided by the panel", "look at its votes (traps why ITEM)")
 BOUNDS = "If missing: worst, best"
 _COUNTS = [count for count in COUNT_WORDS.values() if count.heading]
 # Columns shown only if their count, or that of another field, is not 0, because the table is already wide.
@@ -79,9 +82,9 @@ LEGEND = {
     "±": "population standard deviation over runs",
     "n": "pairs (one control, one void) per run",
     "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
-    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall figure is incomplete if that of "
+    INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall metric is incomplete if that of "
     "any dataset is",
-    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall figure is broken if that of any dataset is",
+    BROKEN_MARK: f"broken: {BROKEN_TEXTS}; an overall metric is broken if that of any dataset is",
     **{
         count.heading: f"{count.meaning}; over all runs{', among the missing ones' if count.outcomes else ''}"
         for count in _COUNTS
@@ -103,15 +106,17 @@ def leaderboard_text(board: pd.DataFrame, two_way: pd.DataFrame | None = None, n
 def leaderboard_tables(
     board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()
 ) -> list[TextTable]:
-    """Return what `leaderboard_text` says, a table per panel."""
-    return [table_text(table) for table in leaderboards(board, two_way, notes, brief=True)]
+    """Return what `leaderboard_text` says, a table per panel, the first below what is missing."""
+    first, *others = (table_text(table) for table in leaderboards(board, two_way, notes, brief=True))
+    lacking = shortfall(board)
+    return [replace(first, title=f"{lacking}\n{first.title}") if lacking else first, *others]
 
 
 def leaderboard_markdown(board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()) -> str:
     """Return LEADERBOARD rows as Markdown, with TWO_WAY, notes and a legend."""
     terms = [f"- **{term}**: {meaning}" for term, meaning in legend(board, two_way).items()]
-    tables = leaderboards(board, two_way, notes, brief=True)
-    return "\n".join([*map(table_markdown, tables), *terms]) + "\n"
+    tables, lacking = leaderboards(board, two_way, notes, brief=True), shortfall(board)
+    return "\n".join([*([f"{lacking}\n"] if lacking else []), *map(table_markdown, tables), *terms]) + "\n"
 
 
 def leaderboards(
@@ -147,6 +152,26 @@ def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool
     return [_leaderboard(board, ranked_dataset, other_datasets, beside, brief, suffix), *other_tables]
 
 
+def shortfall(board: pd.DataFrame) -> str:
+    """Return why models lack answers, and what to change, in a sentence; empty if none lacks a fifth of them."""
+    rows = board.loc[board["dataset"] != "overall"]
+    rows = rows.assign(asked=2 * rows["n_pairs"].astype(int) * rows["n_runs"].astype(int))
+    sums = rows.groupby("model", sort=False)[["asked", "n_missing"]].sum()
+    models = [*sums.index[sums["n_missing"] > LACKING * sums["asked"]]]
+    if not models:
+        return ""
+    lacking = rows.loc[rows["model"].isin(models)]
+    counts = {(c.participle, c.remedy): int(lacking[c.name].sum()) for c in COUNT_WORDS.values() if c.participle}
+    counts[_UNDECIDED] = int(lacking["n_missing"].sum()) - sum(counts.values())
+    reasons = sorted(((count, *words) for words, count in counts.items() if count > 0), key=lambda reason: -reason[0])
+    (first, participle, _), *others = reasons
+    were = f"{'was' if first == 1 else 'were'} {participle}"
+    text = f"{first:,} of {count_noun(int(lacking['asked'].sum()), 'answer')} {were}"
+    text += "".join(f", {count:,} {words}" for count, words, _ in others)
+    names = ", ".join(models[:3]) + (f" and {len(models) - 3} more" if len(models) > 3 else "")
+    return f"{names}: {text}: {', or '.join(dict.fromkeys(remedy for _, _, remedy in reasons[:2]))}."
+
+
 def legend(board: pd.DataFrame, two_way: pd.DataFrame | None = None) -> dict[str, str]:
     """Return the entries of LEGEND for the board's columns and marks."""
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
@@ -173,7 +198,7 @@ def judged_by(board: pd.DataFrame) -> str:
     names = [_panel_in_words(panel) for panel in panels]
     has_several_panels = len(panels) > 1
     sentence = f"Judged by the panel{'s' * has_several_panels} {' and '.join(names) or NONE}"
-    sentence += "; figures of different panels are not ranked or compared" * has_several_panels
+    sentence += "; metrics of different panels are not ranked or compared" * has_several_panels
     rows = board[["panel", "model"]].drop_duplicates().itertuples(index=False, name=None)
     rule_judged_models = sorted({model for panel, model in rows if is_judged_by_rules(panel, model)})
     names_shown = ", ".join(rule_judged_models[:5]) + (
@@ -232,10 +257,7 @@ def _trace(row: Mapping[str, Any], field: str) -> SourceItems | None:
 
 
 def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.DataFrame:
-    """Return one row per (model, regime), best first.
-
-    Without a row of the dataset, counts are sums over all rows.
-    """
+    """Return one row per (model, regime), best first. Without a row of the dataset, counts are sums over all rows."""
     rows, entries = [], dict[tuple[str, str], dict[str, dict[str, Any]]]()
     for row in null_single_deviations(board).to_dict("records"):
         entries.setdefault((row["model"], row["regime"]), {})[row["dataset"]] = row
@@ -258,17 +280,8 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
             entry |= {name: row["pecs"], f"{name}_mark": _mark(row)} if row else {}
         rows.append(entry)
     columns = [column.name for column in LEADERBOARD.columns]
-    marks = [
-        "mark",
-        "n_mark",
-        "model_mark",
-        "missing_mark",
-        "overruled_mark",
-        "ci",
-        "bounds",
-        *others,
-        *(f"{name}_mark" for name in others),
-    ]
+    kinds = ("mark", "n_mark", "model_mark", "missing_mark", "overruled_mark", "ci", "bounds")
+    marks = [*kinds, *others, *(f"{name}_mark" for name in others)]
     return pd.DataFrame(sorted(rows, key=_rank), columns=pd.Index([*columns, *marks]))
 
 

@@ -43,9 +43,8 @@ def report_html(
     ]  # fmt: skip
     run = [[card for card in cards if card.html] for cards in (figures, pictures, [*other_cards, *tables])]
     names_by_reason: dict[str, list[str]] = {}
-    for card in (*figures, *pictures, *tables):
-        if not card.html:
-            names_by_reason.setdefault(card.why, []).append(card.title)
+    for card in (card for card in (*figures, *pictures, *tables) if not card.html):
+        names_by_reason.setdefault(card.why, []).append(card.title)
     script = (TEMPLATES / "report.js").read_text(encoding="utf-8")
     return (
         environment()

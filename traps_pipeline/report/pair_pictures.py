@@ -26,7 +26,7 @@ NO_ITEMS = "this study has no items yet"
 
 @dataclass(frozen=True)
 class Picture:
-    """One or several figures of clips, by file name.
+    """A card of the report made of clips: one or several figures, by file name.
 
     make: raises NotRun and DamagedClip. inputs: returns what they show of the stages `reads`, as JSON; raises
     DamagedClip.
@@ -43,7 +43,7 @@ class Picture:
         return _require_clips(self.make)
 
     def shown(self) -> Any:
-        """Return `inputs`. Raises TrapsError for a damaged clip."""
+        """Return what the picture shows, as JSON. Raises TrapsError for a damaged clip."""
         return _require_clips(self.inputs)
 
 
@@ -70,11 +70,11 @@ class PairPictures:
 
     @cached_property
     def arms(self) -> pd.DataFrame:
-        """ARMS rows."""
+        """The study's ARMS rows."""
         return self.workspace.tables.read_all(ARMS)
 
     def all(self) -> list[Picture]:
-        """Return all pictures."""
+        """Return every picture of pairs that the report can show."""
         visual = self.items.loc[self.items["dataset"].isin(["occlusion", "chaotic"])] if len(self.items) else self.items
         pair_items = six_pairs(self.items) if len(self.items) else self.items
         example = worked_example(self.workspace)
@@ -96,7 +96,7 @@ class PairPictures:
 
     def _six(self, rows: pd.DataFrame) -> Figure:
         if not len(rows):
-            raise NotRun(NO_ITEMS)
+            raise NotRun("no pair has items of both sides")
         return pairs_figure(rows, self.workspace.bring(rows["clip"]))
 
     def _arms(self) -> Mapping[str, Figure]:

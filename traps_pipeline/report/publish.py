@@ -9,8 +9,10 @@ from typing import Any
 
 import pandas as pd
 
+from traps_pipeline.base.archives import pack
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.report.cards import (
     EXPLORER,
     Address,
@@ -22,7 +24,7 @@ from traps_pipeline.report.cards import (
     picture_card,
     table_card,
 )
-from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, TABLE_REPORTS
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, TABLE_REPORTS, TableReport
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import report_html
 from traps_pipeline.report.pair_pictures import PairPictures
@@ -75,7 +77,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
             report.name,
             lambda report=report: table_card(report, sources, address),
             report.reads,
-            lambda report=report: [table.content for table in report.tables(sources.study)],
+            lambda report=report: _contents(report, sources.study),
         )
         for report in TABLE_REPORTS
     ]
@@ -88,11 +90,21 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
     return [*figures, *pictures, *tables, *paper]
 
 
+def _contents(report: TableReport, study: Results) -> list[Any]:
+    """Return what a report's tables show; of one that cannot be made, the error, which its card names."""
+    try:
+        return [table.content for table in report.tables(study)]
+    except TrapsError:
+        raise
+    except Exception as error:  # noqa: BLE001 - one table must not cost the others
+        return [repr(error)]
+
+
 def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
     """Return report page and leaderboard (Markdown, JSON lines) by path, from cards."""
-    remarks = people_notes(study.human_row, study.panel_errors)
+    remarks = people_notes(study.human_row, study.panel_errors, study.certified)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
         [replace(card, paper=paper.get(card.name, "")) for chapter, card in cards if chapter == name]
@@ -113,16 +125,20 @@ def metrics_lines(board: pd.DataFrame) -> str:
 
 
 def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lambda line: None) -> int:
-    """Write all tables, available figures and the report page; return the file count.
+    """Write all tables, available figures and the report page to a folder or a .zip; return the file count.
 
     Each file is written atomically, `index.html`, which lists them, last. say: receives a line per file.
     """
-    refuse_held_out(workspace.root, "its tables and pictures")
-    sources, paths = Sources(workspace), list[str]()
-    for path, content in _export_reports(sources, say):
-        write_bytes(target / path, content)
+    begin_publication(workspace.root, "its tables and pictures")
+    is_zip, members, paths = target.suffix == ".zip", dict[str, bytes](), list[str]()
+    for path, content in _export_reports(Sources(workspace), say):
         paths.append(path)
-    write_bytes(target / INDEX, _index(paths).encode())
+        if is_zip:
+            members[path] = content
+        else:
+            write_bytes(target / path, content)
+    index = _index(paths).encode()
+    write_bytes(*((target, pack(members | {INDEX: index}, level=6)) if is_zip else (target / INDEX, index)))
     return len(paths) + 1
 
 

@@ -15,15 +15,15 @@ from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.control_rows import (
     GATE,
     ITEM_SCORES,
+    LEADS,
     LENS,
     PATCHING,
     PROBE_BASELINES,
-    RISK_COVERAGE,
     SENTENCES,
     STEERING_NULLS,
     STEERING_PECS,
 )
-from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_EFFECTS, STEERING_SHARES
+from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_SHARES
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.protocol.datasets import DATASETS
@@ -86,6 +86,7 @@ class Results:
     source = ""  # in words, for titles
     is_study = False
     judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
+    certified = ""  # how many recorded pairs people certify, for the notes of its tables
     mechanism: MechanismSettings | None = None  # of a study that looks inside models
 
     board = table_frame(LEADERBOARD)
@@ -126,14 +127,12 @@ class Results:
     effects = own("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
     baselines = cached_property(lambda results: _probe_prompt_rows(results.prompted_baselines))
     gate = table_frame(GATE)
-    risk_coverage = table_frame(RISK_COVERAGE)
     patching = table_frame(PATCHING)
-    # STEERING_EFFECTS rows of datasets along their own directions and nulls, and `gaps`, the dose.
-    own_effects = cached_property(lambda results: effects.own_effects(results.rows(STEERING_EFFECTS)))
     nulls = table_frame(STEERING_NULLS)
     steering_pecs = table_frame(STEERING_PECS)
     shares = table_frame(STEERING_SHARES)
     steering_regimes = cached_property(lambda results: effects.regime_matrix(results.effects))
+    leads = table_frame(LEADS)
     lens = table_frame(LENS)
     sentences = table_frame(SENTENCES)
     item_scores = table_frame(ITEM_SCORES)  # under PROBE_PROMPT alone

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
+from traps_pipeline.models.registry.entries import is_reference, reference_rows
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES, STANDARD
-from traps_pipeline.report.catalogue import FIGURE_REPORTS
+from traps_pipeline.report.catalogue import FIGURE_REPORTS, FigureReport
+from traps_pipeline.report.leaderboard_page import shortfall
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import interval, ranks
 from traps_pipeline.report.writing import fraction, percent
-from traps_pipeline.scoring.analyses import models_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,24 +34,34 @@ class StudyFinding:
 
 def study_findings(results: Results) -> list[StudyFinding]:
     """Return a study's findings, the most important first. Of reference strategies only if no other model was asked."""
-    overall = results.overall
-    rows = overall.loc[overall["pecs"].notna()] if len(overall) else overall
-    if not len(rows):
-        return [*_two_events(results)]
-    model_rows = _models_first(rows)
-    figure_findings = [(report.name, report.finding(results)) for report in FIGURE_REPORTS] if results.mechanism else []
+    overall, lacking = results.overall, shortfall(results.board) if len(results.board) else ""
+    missing = [StudyFinding(lacking, "leaderboard")] if lacking else []
+    model_rows = _models_first(overall).dropna(subset=["pecs"]) if len(overall) else overall
+    if not len(model_rows):
+        return [*missing, *_two_events(results)]
+    reports = FIGURE_REPORTS if results.mechanism else ()
+    figure_findings = [(report.name, _finding(report, results)) for report in reports]
     return [
-        *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),
+        *missing, *_best(model_rows), *_abstention(model_rows), *_accuracy(model_rows), *_gaps(results, model_rows),
         *_two_events(results), *_separable(results, model_rows),
-        *_missing_answers(model_rows),
+        *(() if missing else _missing_answers(model_rows)),
         *(StudyFinding(text, f"figure-{name}") for name, text in figure_findings if text),
     ]  # fmt: skip
 
 
+def _finding(report: FigureReport, results: Results) -> str:
+    """Return a figure's finding; empty if it cannot be made, which its card says."""
+    try:
+        return report.finding(results)
+    except TrapsError:
+        raise
+    except Exception:  # noqa: BLE001 - one figure must not cost the others
+        return ""
+
+
 def _models_first(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of models; those of reference strategies if there are no others."""
-    references = models_of(group="reference")
-    model_rows = rows.loc[[model not in references for model in rows["model"]]]
+    model_rows = rows.loc[~rows["model"].isin(reference_rows())]
     return model_rows if len(model_rows) else rows
 
 
@@ -65,7 +77,8 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         best = (
             "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse_rows else "has a PECS of"
         )
-        text = f"Under {regime}, {_names(equal)} {best} {figure} {interval(first)}".strip()
+        group = "" if _noun(part) == "models" else f" among {_noun(part)}"
+        text = f"Under {regime},{group} {_names(equal)} {best} {figure} {interval(first)}".strip()
         if worse_rows:
             text += (
                 f", before {worse_rows[0]} with {fraction(part.loc[part['model'] == worse_rows[0], 'pecs'].iloc[0])}"
@@ -74,6 +87,11 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(equal) == 1 and "–" in rank_range:
             text += f"; its rank may be {rank_range}, since contrasts do not separate it from others"
         yield StudyFinding(f"{text}.", "leaderboard")
+
+
+def _noun(rows: pd.DataFrame) -> str:
+    """Return what the rows are of: models, or reference strategies alone."""
+    return "reference strategies" if any(map(is_reference, rows["model"])) else "models"
 
 
 def _names(models: list[str]) -> str:
@@ -87,7 +105,7 @@ def _abstention(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     for regime, words in REGIME_WORDS.items():
         part = rows.loc[rows["regime"] == regime]
         if len(part):
-            subject = f"the {len(part)} models abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
+            subject = f"the {len(part)} {_noun(part)} abstain" if len(part) > 1 else f"{part['model'].iloc[0]} abstains"
             voids, controls = (_span(part[name]) for name in ("abs_rec", "false_abs"))
             yield StudyFinding(
                 f"{words}, {subject} on {voids} of the voids, which cannot be answered, and on {controls} of the "
@@ -119,7 +137,11 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     pooled_rates = pooled_rates.dropna(subset=["visual", "textual"])
     if len(pooled_rates):
         textual, visual = (percent(pooled_rates[name].to_numpy(float).mean()) for name in ("textual", "visual"))
-        subject = f"the {len(pooled_rates)} models" if len(pooled_rates) > 1 else str(pooled_rates["model"].iloc[0])
+        subject = (
+            f"the {len(pooled_rates)} {_noun(pooled_rates)}"
+            if len(pooled_rates) > 1
+            else str(pooled_rates["model"].iloc[0])
+        )
         yield StudyFinding(
             f"Asked plainly, {subject} abstain{'' if len(pooled_rates) > 1 else 's'} on {textual} % of the questions "
             f"about something that no clip shows, and on {visual} % of the clips whose outcome is hidden or cut off"
@@ -154,7 +176,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
         if len(tested):
             count = int(tested["separable"].eq(True).sum())
             yield StudyFinding(
-                f"Of {count_noun(len(tested), 'difference')} of PECS between models under one regime, {count} "
+                f"Of {count_noun(len(tested), 'difference')} of PECS between {_noun(rows)} under one regime, {count} "
                 f"{'is' if count == 1 else 'are'} significant after Holm’s correction.",
                 "table-contrasts",
             )
@@ -163,10 +185,9 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
 def _missing_answers(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     missing = int(np.nansum(rows["n_missing"].to_numpy(float)))
     if missing:
-        answers = 2 * int((rows["n_pairs"].to_numpy(int) * rows["n_runs"].to_numpy(int)).sum())
         worst_row = rows.sort_values(["n_missing", "model"], ascending=[False, True]).to_dict("records")[0]
         yield StudyFinding(
-            f"Without text or majority: {missing:,} of {count_noun(answers, 'answer')}; {worst_row['model']} under "
+            f"Without text or majority: {count_noun(missing, 'answer')}; {worst_row['model']} under "
             f"{worst_row['regime']} lacks most, {int(worst_row['n_missing'])}.",
             "leaderboard",
         )

@@ -10,7 +10,9 @@ from typing_extensions import override
 
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.models.registry.judges import panel_id
+from traps_pipeline.people.recorded_certificates import certification_note
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
 from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, concat_frames
@@ -127,12 +129,12 @@ def _ill_posed(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _without_references(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows without reference strategies, if other models were asked."""
-    kept_rows = rows.loc[~rows["model"].isin(analyses.models_of(group="reference"))]
+    kept_rows = rows.loc[~rows["model"].isin(reference_rows())]
     return kept_rows if len(kept_rows) else rows
 
 
 class StudyResults(Results):
-    """A workspace's own tables."""
+    """A study's results, from the tables of its workspace."""
 
     source = "this study"
     is_study = True
@@ -163,13 +165,18 @@ class StudyResults(Results):
 
     @cached_property
     @override
+    def certified(self) -> str:
+        return certification_note(self.tables)
+
+    @cached_property
+    @override
     def judged_by(self) -> str:
         if self.board.empty:
             return ""
         sentence = judged_by(_panel_rows(self, self.board)).rstrip(".")
         other_models = self.board.loc[self.board["panel"] != self.panel, "model"].unique()
         return sentence + (
-            f"; left out: {count_noun(len(other_models), 'model')} with figures of other panels"
+            f"; left out: {count_noun(len(other_models), 'model')} with metrics of other panels"
             if len(other_models)
             else ""
         )

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.report.contact_sheet import Layout, draw_pair, moments_of, ratio_of
 from traps_pipeline.report.writing import PAGE_IN, figure_style, new_figure, plain
-from traps_pipeline.scoring.analyses import models_of
 from traps_pipeline.storage.benchmark_tables import ITEMS
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
         (row["pair_id"], row["model"], row["run"]): bool(row["abstained"])
         for row in decided_verdicts.loc[decided_verdicts["side"] == "void"].to_dict("records")
     }
-    references = models_of(group="reference")
+    references = reference_rows()
     controls = [
         row
         for row in decided_verdicts.loc[decided_verdicts["side"] == "control"].to_dict("records")

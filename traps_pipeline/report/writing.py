@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.sheets import csv_bytes
 from traps_pipeline.base.terminal import TextTable, finalize_value, plain
+from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.report.latex_tables import latex, latex_of_plain, latex_table
 from traps_pipeline.report.numbers import NONE, as_numbers
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "templates"
 STYLE = ASSETS / "figures.mplstyle"
 NOT_RUN = "not run"
+REFERENCE_ROWS = "Reference rows"  # of strategies and rules, which no text calls models
 TABLE_KINDS = ("parquet", "csv", "tex", "md")
 FIGURE_KINDS = ("pdf", "svg", "png")
 
@@ -123,6 +125,8 @@ class Column:
         import pandas as pd
 
         value = row.get(self.field)
+        if row.get("model") == REFERENCE_ROWS:
+            return value or "", "", ""
         if self.unit in ("text", "range"):
             return "" if value is None or value is pd.NA or value != value else plain(value), "", ""
         figure = self._number(value)
@@ -150,8 +154,8 @@ class PrintedTable:
     """A table for people: a frame, its printed columns, and notes (epoch, n, gaps).
 
     A table without rows says that it was not run, and `why`; if it was run and is legitimately empty, it prints `none`
-    instead. `trace` returns the items behind a number, or None; `dash` and `deviation` are the meanings of a dash and
-    of ±; `lead` is a sentence after the title.
+    instead. Reference rows come last, below a heading. `trace` returns the items behind a number, or None; `dash` and
+    `deviation` are the meanings of a dash and of ±; `lead` is a sentence after the title.
     """
 
     name: str
@@ -179,8 +183,12 @@ class PrintedTable:
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
-        """The rows as mappings."""
-        return self.rows.to_dict("records")  # pyright: ignore[reportReturnType]
+        """The rows as mappings: of models, then a heading and reference rows."""
+        rows: list[dict[str, Any]] = self.rows.to_dict("records")  # pyright: ignore[reportAssignmentType]
+        if not self.columns or self.columns[0].field != "model":
+            return rows
+        models, others = ([row for row in rows if is_reference(row["model"]) == kind] for kind in (False, True))
+        return [*models, *([{"model": REFERENCE_ROWS}, *others] if others else [])]
 
     @property
     def content(self) -> str:

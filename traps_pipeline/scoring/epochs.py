@@ -43,7 +43,7 @@ def require_one_epoch(epochs: pd.DataFrame, figure: str) -> None:
     sides = ", ".join(f"{side} from epoch {epoch!r}" for side, epoch in mixed_rows.iloc[0].dropna().items())
     suffix = f" (and {len(mixed_rows) - 1} more)" if len(mixed_rows) > 1 else ""
     raise EpochMismatch(
-        f"{figure}: {names} has {sides}{suffix}; figures of different epochs are never put in one ratio, contrast or "
+        f"{figure}: {names} has {sides}{suffix}; metrics of different epochs are never put in one ratio, contrast or "
         "gap: evaluate both sides in one epoch, or leave this one out"
     )
 
@@ -89,9 +89,9 @@ def refusal(left: Answered, right: Answered) -> str | None:
     if not mixed_items:
         left_names, right_names = (" and ".join(names) for names in panels)
         judged = f"judged by {left_names} on one side and by {right_names} on the other"
-        return f"{judged}; figures of different panels are not compared"
+        return f"{judged}; metrics of different panels are not compared"
     epochs = f"epoch {left[mixed_items[0]].epoch} against epoch {right[mixed_items[0]].epoch}"
-    return f"{_name_first(mixed_items)} of {epochs}; figures of different epochs are never put in one contrast"
+    return f"{_name_first(mixed_items)} of {epochs}; metrics of different epochs are never put in one contrast"
 
 
 def _name_first(items: list[str]) -> str:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from traps_pipeline.models.request import JUDGED
-from traps_pipeline.protocol.datasets import sides_of
 from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.scoring.score_rows import METRICS
 
@@ -55,6 +54,11 @@ def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame({name: flags.astype("int64") for name, flags in counts.items()})
 
 
+def n_items(counts: Any) -> Any:
+    """Return how many items METRICS rows are of: each item has one outcome."""
+    return sum(counts[name] for name in OUTCOMES)
+
+
 def pecs_of(acc: np.ndarray, j: np.ndarray) -> np.ndarray:
     """Return PECS = Acc x max(0, J), elementwise; NaN where either is."""
     return acc * np.maximum(j, 0.0)
@@ -66,8 +70,8 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x/y` (y: the control's answer
     in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Figures are
     fractions; a figure whose denominator is 0 is null, and so is every figure computed from it. `n_missing` counts the
-    items, of 2 n_pairs (of n_pairs if the dataset is an arm of one side), that lack a decision: abstained or correct on
-    a control, abstained on a void. BOUNDS show how far the missing decisions could move PECS; they are never null.
+    asked items that lack a decision: abstained or correct on a control, abstained on a void. BOUNDS show how far the
+    missing decisions could move PECS; they are never null.
     Every share has its n and its Wilson interval.
 
     Raises ValueError if the verdicts are of several datasets, whose versions may differ (docs/spec.md 5.1).
@@ -76,11 +80,10 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     if len(datasets) > 1:
         raise ValueError(f"verdicts of several datasets {datasets}: score one dataset at a time")
     groups = _with_scopes(verdicts, scoped_by).groupby([*CELL, "scope"], sort=True)
-    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", *COUNT_COLUMNS]].sum())
+    sums = cast("pd.DataFrame", groups[[*COUNTS, "complete", "controls", *COUNT_COLUMNS]].sum())
     sums[REJECTION_COLUMNS] = groups[REJECTION_COLUMNS].sum(min_count=1)
     sums["n_pairs"] = groups["pair_id"].nunique()
-    sides = sides_of(datasets[0]) if datasets else ()
-    sums["n_missing"] = len(sides) * sums["n_pairs"] - sums["complete"]
+    sums["n_missing"] = n_items(sums) - sums["complete"]
     sums["epoch"] = joined_in_groups(groups, "epoch", joined_epochs)
     sums["panel"] = joined_in_groups(groups, "panel", joined_epochs)
     sums["benchmark_version"] = joined_in_groups(groups, "benchmark_version", joined_versions)
@@ -123,7 +126,9 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     is_answered = rejects_premise & ~verdicts["abstained"].astype("boolean").fillna(False)
     optional = (rejects_premise, is_answered, verdicts["overruled"].astype("boolean"))
     rejections = {name: f.astype("Int64") for name, f in zip(REJECTION_COLUMNS, optional, strict=True)}
-    flags = counts.assign(complete=is_complete, **outcomes, n_not_json=is_not_json, **rejections)
+    flags = counts.assign(
+        complete=is_complete, controls=is_control.astype("int64"), **outcomes, n_not_json=is_not_json, **rejections
+    )
     items = pd.concat([verdicts[[*CELL, "pair_id", "epoch", "panel", "benchmark_version"]], flags], axis=1)
     scopes = [pd.Series("all", index=items.index)]
     for prefix, columns in scoped_by.items():
@@ -145,14 +150,15 @@ def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     Each decision is bounded separately, since an item may lack only one; PECS rises with Acc and AbsRec and falls with
     FalseAbs, so that these two are its exact extremes. If nothing is missing both equal PECS bit for bit.
     """
-    pairs = sums["n_pairs"].to_numpy(float)
-    yes_counts = {name: sums[name].to_numpy(float) for name in ("correct", "false_abs", "abs_rec")}
-    undecided_counts = {name: pairs - sums[f"{name}_of"].to_numpy(float) for name in yes_counts}
-    lower_bounds = {name: yes_counts[name] / pairs for name in yes_counts}
-    upper_bounds = {name: (yes_counts[name] + undecided_counts[name]) / pairs for name in yes_counts}
+    controls, voids = sums["controls"].to_numpy(float), (n_items(sums) - sums["controls"]).to_numpy(float)
+    low, high = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    for name, asked in (("correct", controls), ("false_abs", controls), ("abs_rec", voids)):
+        yes, undecided = sums[name].to_numpy(float), asked - sums[f"{name}_of"].to_numpy(float)
+        low[name] = yes / np.maximum(asked, 1)
+        high[name] = np.where(asked > 0, (yes + undecided) / np.maximum(asked, 1), 1.0)  # of nothing asked: anything
     return {
-        "pecs_low": pecs_of(lower_bounds["correct"], lower_bounds["abs_rec"] - upper_bounds["false_abs"]),
-        "pecs_high": pecs_of(upper_bounds["correct"], upper_bounds["abs_rec"] - lower_bounds["false_abs"]),
+        "pecs_low": pecs_of(low["correct"], low["abs_rec"] - high["false_abs"]),
+        "pecs_high": pecs_of(high["correct"], high["abs_rec"] - low["false_abs"]),
     }
 
 

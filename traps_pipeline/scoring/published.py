@@ -55,10 +55,7 @@ def published_cells() -> pd.DataFrame:
 
 
 def published_overall() -> pd.DataFrame:
-    """Return the printed overall leaderboard, shares as fractions.
-
-    Columns: model, regime, acc, abs_rec, false_abs, pecs.
-    """
+    """Return the printed overall leaderboard: model, regime, acc, abs_rec, false_abs, pecs, as fractions."""
     rows = published("overall")
     shares = {share: rows[printed_column] / 100 for share, printed_column in _RENAMED.items()}
     return rows.loc[:, ["model", "regime"]].assign(**shares, pecs=rows["pecs"])

@@ -16,7 +16,7 @@ BROKEN_ABOVE = 0.01  # a model that says nothing in more of its answers than thi
 Mean = Annotated[float | None, "mean over runs"]
 Deviation = Annotated[float | None, "population standard deviation over runs"]
 Bootstrap = Annotated[
-    float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen; null without a figure"
+    float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen; null without a value"
 ]
 # Marks of a figure, which declare the columns beside it.
 STD, CI, WILSON = (
@@ -41,7 +41,7 @@ class MetricsRow(shared.CellRow):
 
     scope: Annotated[str, "all, category:.., sub_scenario:.. or label:../.. (the control's answer in a sub-scenario)"]
     n_pairs: Annotated[int, "pairs in scope"]
-    n_missing: Annotated[int, "items (of 2 n_pairs; in an arm of one side of n_pairs) without an answer or a majority"]
+    n_missing: Annotated[int, "asked items without an answer or a majority"]
     counts: Annotated[int, "", EACH_COUNT]
     decisions: Annotated[int | None, "", EACH_COUNT_OF_DECISIONS]
     n_answered: Annotated[int, "items with an answer"]
@@ -88,7 +88,7 @@ class ContrastRow:
     ]
     p_holm: Annotated[
         float | None,
-        "corrected by Holm over the rows of the same kind, dataset and figure (for models, also the same regime)",
+        "corrected by Holm over the rows of the same kind, dataset and metric (for models, also the same regime)",
     ]
     separable: Annotated[bool | None, "whether p_holm is below 0.05; null: too few scenarios for any answers to be"]
     refused: Refused
@@ -139,14 +139,14 @@ class LeaderboardRow(shared.EntryRow):
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     counts: Annotated[int, "over runs", EACH_COUNT]
     decisions: Annotated[int | None, "over runs", EACH_COUNT_OF_DECISIONS]
-    answered: Annotated[float, "share of items (2 a pair and run) with an answer"]
+    answered: Annotated[float, "share of asked items with an answer"]
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
     broken: Annotated[float, "share of items whose text is empty, truncated, unfinished, degenerate or unread"]
     is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
     figures: Annotated[Mean, EACH_METRIC, STD, CI]
     rank: Annotated[
         int | None,
-        "by PECS among the models of this regime, dataset and panel; equal values share a rank; null if of two panels",
+        "by PECS among models, or reference rows, of a regime, dataset and panel; ties share it; null if of two panels",
     ]
     rank_low: Annotated[
         int | None,
@@ -210,10 +210,10 @@ class HypothesisRow(shared.EntryRow):
     false_abs: Annotated[float | None, "share of controls abstained on; of what is neither, the share abstained on", CI]
     abs_rec: Annotated[float | None, "share of voids abstained on", CI]
     j: Annotated[float | None, "abs_rec - false_abs", CI]
-    compared: Annotated[str, "the figure that doses are compared by: j, or abstains, of all items of the dose"]
+    compared: Annotated[str, "the metric that doses are compared by: j, or abstains, of all items of the dose"]
     value: Annotated[float | None, "that figure"]
     n_compared: Annotated[int | None, "scenarios that the dose and its reference both have; null where refused"]
-    at_reference: Annotated[float | None, "that figure at the reference, on the scenarios that both have"]
+    at_reference: Annotated[float | None, "that metric at the reference, on the scenarios that both have"]
     change: Annotated[float | None, "by how much the dose is above it; null where refused", CI]
     chance: Annotated[float | None, "Acc of a guess among the answers that the questions offer"]
     rule: Annotated[str | None, "of the rules with one cue that with the highest value here; null if none was run"]
@@ -238,7 +238,7 @@ class GradedRow(shared.EntryRow):
 
     scope: Annotated[str, "all, or the range of the commonest answer's probability, such as 0.6 to 0.75"]
     n_runs: Annotated[int, "runs averaged"]
-    n_items: Annotated[int, "items with a decision in some run: what all figures are of"]
+    n_items: Annotated[int, "items with a decision in some run: what all metrics are of"]
     n_missing: Annotated[int, "items without a decision, over runs: no answer, no majority, no readable probabilities"]
     top: Annotated[float | None, "mean probability of the commonest answer"]
     coverage: Annotated[float | None, "share answered; of stated probabilities, where the largest is worth its risk"]

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import BROKEN_COUNTS, METRIC_WORDS
 from traps_pipeline.scoring.bootstrap import ENTRY, limits_of
@@ -21,6 +22,7 @@ from traps_pipeline.scoring.metrics import (
     joined_epochs,
     joined_in_groups,
     joined_versions,
+    n_items,
     pecs_of,
 )
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW, LEADERBOARD
@@ -70,7 +72,7 @@ def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
     """Return METRICS rows with n_items, by model, regime, dataset (or overall), run."""
     cells = metrics.loc[metrics["scope"] == "all"]
-    cells = cells.assign(n_items=2 * cells["n_pairs"]).merge(_family_pecs(metrics), on=CELL, how="left")
+    cells = cells.assign(n_items=n_items(cells)).merge(_family_pecs(metrics), on=CELL, how="left")
     return pd.concat([cells, _overall_runs(cells)], ignore_index=True)
 
 
@@ -121,17 +123,19 @@ def group_figure(groups: Any, columns: Sequence[str], figure: Callable[..., np.n
 def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     """Return rank, rank_low and rank_high within the panel, on `board`'s index.
 
-    Null without PECS, and if the row is of several panels.
+    Null without PECS, and if the row is of several panels. Reference rows have ranks of their own.
     """
     is_separable = contrasts["separable"].astype("boolean").fillna(False)
-    separable = contrasts.loc[(contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & is_separable]
+    left, right = (contrasts[name].isin(reference_rows()) for name in ("left_model", "right_model"))
+    is_ranking = (contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & (left == right)
+    separable = contrasts.loc[is_ranking & is_separable]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
     for row in separable.to_dict("records"):
         winner, loser = (row["left_model"], row["right_model"])[:: 1 if row["difference"] > 0 else -1]
         wins[winner, row["left_regime"], row["dataset"]] += 1
         losses[loser, row["left_regime"], row["dataset"]] += 1
     entries = list(board[ENTRY].itertuples(index=False, name=None))
-    peers = board.groupby(["regime", "dataset", "panel"])["pecs"]
+    peers = board.groupby(["regime", "dataset", "panel", board["model"].isin(reference_rows())])["pecs"]
     ranks = {
         "rank": peers.rank(method="min", ascending=False),
         "rank_low": pd.Series([1 + losses[entry] for entry in entries], board.index),

@@ -332,7 +332,8 @@ def _verified_bytes(path: Path) -> bytes:
     place = content.rfind(_MARK) + len(_MARK)
     if _VERIFIED.get(path) != stamp:
         if place < len(_MARK) or content[place : place + len(_ZEROS)] != _sum_of(content):
-            raise TrapsError(f"{path}: is not what was written (it was altered); materialize it again")
+            remedy = "`traps status` names the command that makes it again, and asks nothing that is in the ledger"
+            raise TrapsError(f"{path}: is not what was written (it was altered); {remedy}")
         _VERIFIED[path] = stamp
     return content
 

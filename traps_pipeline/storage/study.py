@@ -16,7 +16,7 @@ Regime = Annotated[str, Field(pattern=f"^({'|'.join(VQA_PROMPTS)})$")]
 
 
 class Settings(BaseModel):
-    """What people write into a file: no unknown field, and no list that names something twice."""
+    """Base of settings that people write: it refuses unknown fields, and lists that name something twice."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -57,7 +57,7 @@ class ProbeSettings(Settings):
 class NullSettings(Settings):
     """The number of null directions of each kind against which an effect is ranked.
 
-    They are steered at the largest dose on the datasets that they come from.
+    They are steered at every alpha and the largest gap on the datasets that they come from.
     """
 
     kinds: tuple[Literal["isotropic", "covariance", "shuffled"], ...] = Field(
@@ -111,9 +111,6 @@ class GateSettings(Settings):
     """The settings of probe-gated abstention (docs/mechanism.md)."""
 
     false_abs: float = Field(default=0.05, gt=0, lt=1, description="of source controls, that conformal gates promise")
-    untrained: bool = Field(
-        default=False, description="also a gate on states of the same network with random weights, loaded beside it"
-    )
 
 
 class PatchingSettings(Settings):
@@ -204,7 +201,7 @@ class Study(Settings):
     scenarios: list[str] | None = Field(default=None, min_length=1, description="named scenarios; all if absent")
     per_family: int | None = Field(default=None, ge=1, description="the first n scenarios of each family")
     panel: str = Field(default="", description="who judges; nothing is judged until one is named")
-    judged_by_rules: bool = Field(default=False, description="rules may judge other models than reference models")
+    judged_by_rules: bool = Field(default=False, description="rules may judge models, not reference strategies alone")
     epoch: str = Field(
         default="1",
         pattern=r"^[A-Za-z0-9_-]+([._-][A-Za-z0-9_-]+)*$",

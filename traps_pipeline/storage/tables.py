@@ -62,7 +62,7 @@ class ExtraColumns:
 
 @dataclass(frozen=True)
 class EachOf:
-    """A mark of a field that stands for several columns, of its type and with its other marks.
+    """Marks a field of a row that declares several columns at once, of one type and with the same marks.
 
     `columns` are their names and meanings; the field's own text comes after each meaning.
     """

@@ -202,7 +202,7 @@ class Workspace:
 
     @cached_property
     def store(self) -> Store:
-        """The study's files."""
+        """The place of the study's files: a folder or a bucket."""
         if not self.study.database:
             return FolderStore(self.root)
         store = several_hosts().open_store(self.place, self.root, self.study)
@@ -211,7 +211,7 @@ class Workspace:
 
     @cached_property
     def tables(self) -> TableStore:
-        """The Parquet tables."""
+        """The study's Parquet tables, to read and write by partition."""
         return TableStore(self.root / "tables", self.store)
 
     @cached_property

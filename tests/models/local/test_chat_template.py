@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
+from tests.conftest import ROOT
 from tests.models.local.test_adapter import FAMILIES, model
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.local.chat_template import MAX_S, render
@@ -49,3 +54,14 @@ def test_a_template_without_end_or_measure_is_refused_and_the_next_one_is_render
     assert time.process_time() - started[0] < 1  # it costs this process nothing
     assert time.monotonic() - started[1] < 9 * (MAX_S + 2)
     assert render("mine", SOUND, TURNS, {"eos_token": "</s>"}) == "Which colour?</s>"
+
+
+@pytest.mark.slow
+def test_a_script_that_renders_one_is_run_once(tmp_path: Path) -> None:
+    """As in a notebook's script without `if __name__ == "__main__"`, whose first lines may have paid for calls."""
+    script = tmp_path / "script.py"
+    render_one = f"from {render.__module__} import render\nprint(render('mine', {SOUND!r}, {TURNS!r}, {{}}))\n"
+    script.write_text(f"print('paid')\n{render_one}")
+    path = os.environ | {"PYTHONPATH": str(ROOT)}
+    finished = subprocess.run([sys.executable, script], env=path, capture_output=True, text=True, timeout=200)
+    assert finished.stdout.splitlines() == ["paid", "Which colour?"], finished.stderr

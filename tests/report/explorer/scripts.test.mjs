@@ -5,8 +5,8 @@ import test from "node:test";
 import vm from "node:vm";
 
 const WEB = new URL("../../../traps_pipeline/report/explorer/web/", import.meta.url);
-const SOURCES = ["numbers.js", "search.js", "download.js", "outcomes.js", "landscape.js", "cases.js"];
-const NAMES = "{ searchTerms, holdsAll, bestPlace, markedParts, csvOf, counted, fraction, mcnemar, casesOf, spreadLabels, countOutcomes, pairOutcomes }";
+const SOURCES = ["numbers.js", "search.js", "download.js", "outcomes.js", "landscape.js", "cases.js", "parts.js"];
+const NAMES = "{ searchTerms, holdsAll, bestPlace, markedParts, csvOf, counted, fraction, mcnemar, casesOf, modelsFirst, withHeading, spreadLabels, countOutcomes, pairOutcomes }";
 const source = SOURCES.map((name) => readFileSync(new URL(name, WEB), "utf8")).join("\n");
 const page = vm.runInNewContext(`${source}\n;(${NAMES})`);
 const plain = (value) => JSON.parse(JSON.stringify(value)); // arrays of another realm are of another class
@@ -54,6 +54,15 @@ test("labels of the landscape stay apart, in order and inside", () => {
   const at = plain(page.spreadLabels([100, 100, 101, 400], 17, 20, 410));
   assert.deepEqual(at, [100, 117, 134, 400]);
   assert.deepEqual(plain(page.spreadLabels([405, 409], 17, 20, 410)), [393, 410]);
+});
+
+test("reference rows come last, below a heading, in the order of their sort", () => {
+  const info = { models: [{ id: "oracle", group: "reference" }, { id: "a", group: "main" }, { id: "b", group: "own" }] };
+  const items = [{ model: "oracle", n: 1 }, { model: "b" }, { model: "oracle", n: 2 }, { model: "a" }];
+  const sorted = page.modelsFirst(info, items);
+  assert.deepEqual(plain(sorted).map(({ model, n }) => [model, n ?? 0]), [["b", 0], ["a", 0], ["oracle", 1], ["oracle", 2]]);
+  assert.deepEqual(plain(page.withHeading(info, sorted, [1, 2, 3, 4])), [1, 2, ["Reference rows"], 3, 4]);
+  assert.deepEqual(plain(page.withHeading(info, sorted.slice(0, 2), [1, 2])), [1, 2]);
 });
 
 // A study of one scene with a visual and a textual pair; an answer is yes (abstained), no, or null (not decided).

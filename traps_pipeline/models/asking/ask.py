@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, ClassVar, Generic, TypeVar
@@ -24,7 +25,7 @@ from traps_pipeline.models.asking.participants import CallContext, Participant, 
 from traps_pipeline.models.asking.refusals import CONTROL, RefusedCalls, control_outcome, refusal, refused_calls
 from traps_pipeline.models.money.budget import Budget, BudgetReached
 from traps_pipeline.models.money.spending import open_budget, share_accounts
-from traps_pipeline.models.registry.entries import Entry
+from traps_pipeline.models.registry.entries import NETWORK, Entry
 from traps_pipeline.models.request import Backend, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import StageOutput
@@ -65,7 +66,7 @@ class SettledCell(Generic[AnyCell, AnyCall]):
 
 @dataclass(frozen=True)
 class Work(Generic[AnyCell, AnyCall, Finished]):
-    """A stage's calls by cell (requested once), and `finish`, which makes its table."""
+    """A stage's calls by cell, and `finish`, which makes its table."""
 
     stage: str
     ledger: Ledger
@@ -74,6 +75,7 @@ class Work(Generic[AnyCell, AnyCall, Finished]):
     epoch: str
     calls: Callable[[AnyCell], Sequence[AnyCall]]
     finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished]
+    is_counted: bool = False  # the progress was told of all calls before the first
 
 
 def collect(
@@ -100,8 +102,35 @@ def collect(
         if any(entry.prices for entry in entry_of.values()):
             progress.current().money(budget.spent_usd, workspace.study.budget_usd)
         participants = Participants(entry_of, make, workspace.study, sharers=sharers)
-        work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish)
+        is_slow = any(entry.backend == NETWORK for entry in entry_of.values())
+        work = Work(stage, ledger, participants, budget, workspace.study.epoch, calls, finish, is_slow)
+        if is_slow:
+            _expect(work, cells)
         yield from run_work(work, cells)
+
+
+def _expect(work: Work[AnyCell, Any, Any], cells: Sequence[AnyCell]) -> None:
+    """Tell the progress of the missing calls of all cells."""
+    totals = Counter[tuple[str, bool]]()
+    for evaluation, evaluation_cells in _by_evaluation(cells):
+        counted = set[str]()
+        for cell in evaluation_cells:
+            with suppress(TrapsError):  # the cell's own turn raises it
+                requests = [call.request for call in work.calls(cell) if call.request.key not in counted]
+                counted.update(request.key for request in requests)
+                recorded = work.ledger.read(evaluation.key, [request.key for request in requests]).settled
+                totals.update((request.participant, request.key in recorded) for request in requests)
+    progress.current().expect(work.stage, _by_name(totals), sum(cell.share for cell in cells))
+
+
+def _by_name(counts: Counter[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
+    """Return the numbers of missing and of recorded calls by model or judge."""
+    return {name: (counts[name, False], counts[name, True]) for name, _ in counts}
+
+
+def _by_evaluation(cells: Sequence[AnyCell]) -> list[tuple[Evaluation, list[AnyCell]]]:
+    ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
+    return [(evaluation, list(group)) for evaluation, group in groupby(ordered, key=lambda cell: cell.evaluation)]
 
 
 @dataclass
@@ -239,10 +268,9 @@ async def _settle_cell(
     its.reported.update(recorded_rows.notes)
     rows = {key: _Held(row) for key, row in recorded_rows.settled.items()}
     missing = [request for key, request in requests.items() if key not in rows]
-    new = Counter(request.participant for request in missing)
-    counts = Counter(request.participant for request in requests.values())
-    calls_by_name = {name: (new[name], count - new[name]) for name, count in counts.items()}
-    report.asking(work.stage, calls_by_name, cell.share)
+    if not work.is_counted:
+        counts = Counter((request.participant, key in rows) for key, request in requests.items())
+        report.asking(work.stage, _by_name(counts), cell.share)
     asker = _Asking(work, its.writer, missing, stop)
     await asker.run()
     rows |= asker.rows
@@ -294,11 +322,9 @@ async def settle(
         finally:
             results.put_nowait(None)
 
-    ordered = sorted(cells, key=lambda cell: (cell.evaluation, cell.dataset))
-    cells_by_evaluation = [(e, list(group)) for e, group in groupby(ordered, key=lambda cell: cell.evaluation)]
     tasks = [
         asyncio.create_task(one_model(list(group)))
-        for _, group in groupby(cells_by_evaluation, key=lambda pair: pair[0].model)
+        for _, group in groupby(_by_evaluation(cells), key=lambda pair: pair[0].model)
     ]
     try:
         open_tasks = len(tasks)

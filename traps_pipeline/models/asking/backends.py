@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import dataclass, replace
+from typing import get_args
 
 from traps_pipeline.base.extras import require
-from traps_pipeline.base.plugins import plugins
+from traps_pipeline.base.plugins import Plugin, plugins
+from traps_pipeline.ledger.rows import replace_impossible
 from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, ModelEntry
-from traps_pipeline.models.request import Backend
+from traps_pipeline.models.request import Backend, Outcome, OutcomeKind, Request, TransientError
 
 
 def require_libraries(entry: Entry) -> None:
@@ -60,4 +63,26 @@ def make_plugin_backend(entry: Entry) -> Backend:
         raise plugin.error(f"makes no backend for {entry.id} ({type(error).__name__}: {error})") from error
     if not inspect.iscoroutinefunction(getattr(backend, "ask", None)):
         raise plugin.error("makes no backend: its `ask` must be `async def ask(self, request) -> Outcome`")
-    return backend
+    return _PluginBackend(plugin, backend)
+
+
+@dataclass(frozen=True)
+class _PluginBackend:
+    """A package's backend, whose errors and impossible answers name the package."""
+
+    plugin: Plugin
+    backend: Backend
+
+    async def ask(self, request: Request) -> Outcome:
+        try:
+            outcome = await self.backend.ask(request)
+        except (TransientError, TimeoutError):
+            raise
+        except Exception as error:  # whatever foreign code raises
+            raise self.plugin.error(f"failed ({type(error).__name__}: {error})") from error
+        if not isinstance(outcome, Outcome) or outcome.kind not in get_args(OutcomeKind):
+            raise self.plugin.error(f"answered with {str(outcome)[:80]!r} in place of an Outcome")
+        row = {"outcome": outcome.kind, **vars(outcome)}
+        if fields := [name for name in replace_impossible(row) if row[name] is None]:
+            raise self.plugin.error(f"answered with an impossible {fields[0]}")
+        return replace(outcome, text=row["text"])  # without half characters

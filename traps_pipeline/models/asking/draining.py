@@ -49,10 +49,12 @@ class drain_on_interrupt:  # noqa: N801 - reads as a verb where it is used
         self._stop.set()
         wait_text, advice = "", "Ctrl-C again stops at once"
         if by is not signal.SIGINT:
-            wait_text, advice = f" {GRACE_S:.0f} s at most", f"{by.name} again stops at once"
+            wait_text, advice = f", {GRACE_S:.0f} s at most", f"{by.name} again stops at once"
             self._loop.call_soon_threadsafe(self._loop.call_later, GRACE_S, self._cancel)
         self._loop.call_soon_threadsafe(lambda: None)  # wakes the loop from its select
-        progress.current().note(f"{by.name}: stopping: waiting{wait_text} for the calls in flight ({advice})")
+        report = progress.current()
+        report.is_stopping = True
+        report.note(f"{by.name}: {report.waiting()}{wait_text} ({advice})")
 
     def _cancel(self) -> None:
         for task in asyncio.all_tasks(self._loop):

@@ -214,8 +214,9 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
             # slept.
             await allowed.require()
             cost_usd = worst_usd
-            async with asyncio.timeout(entry.limits.timeout_s):
-                outcome = await participant.backend.ask(request)
+            with progress.current().in_flight(entry.id):
+                async with asyncio.timeout(entry.limits.timeout_s):
+                    outcome = await participant.backend.ask(request)
             if entry.prices is not None:
                 cost_usd = _believed_cost(outcome.cost_usd, worst_usd)
                 outcome = replace(outcome, cost_usd=cost_usd)
@@ -225,6 +226,10 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
                 reason = f"no connection was made within {entry.limits.timeout_s:g} s"
                 raise TransientError(UNREACHABLE, billed=False, why=reason) from None
             raise TransientError("timeout") from None
+        except asyncio.CancelledError:
+            if (task := asyncio.current_task()) and not task.cancelling():  # nobody stops this call: its backend fails
+                raise TransientError("cancelled") from None
+            raise
         except TransientError as failure:
             cost_usd = _believed_cost(failure.cost_usd, worst_usd) if failure.billed else 0.0
             raise

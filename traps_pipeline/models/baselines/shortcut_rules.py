@@ -52,7 +52,7 @@ RULES: Mapping[str, tuple[str, ...]] = {**{name: (name,) for name in CUES}, "any
 
 
 class RuleBackend:
-    """A reference model that plays the rule that `params.rule` names."""
+    """A reference strategy that plays the rule that `params.rule` names."""
 
     async def ask(self, request: Request) -> Outcome:
         """Return the outcome of one attempt; see `Backend`."""

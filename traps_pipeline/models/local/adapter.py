@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import gc
 from collections import OrderedDict
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 
@@ -39,13 +40,16 @@ from traps_pipeline.models.registry.local_settings import SPREAD, LocalParams
 __all__ = ["GeneratedAnswer", "LocalModel", "Prompt", "Sampling", "States", "load_local_model", "require_device"]
 
 NF4_CPU_BLOCK = 64
+_UNQUANTISED = {"quantisation": "none", "nf4_skip": ()}
 WEIGHTS_SHARE = 0.7  # share of free memory for weights before other models are unloaded; the rest is for batches
 _LOADED: OrderedDict[str, LocalModel] = OrderedDict()  # the most recently used one comes last
 _LOADING = Lock()
 
 
-def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
+def load_local_model(entry: ModelEntry, *, inside: bool = False, seed: int | None = None) -> LocalModel:
     """Return the entry's checkpoint in memory, loaded once per process.
+
+    seed: give the same network random weights of this seed instead, as its class initialises them, unquantised.
 
     It is unloaded if another model needs its memory. inside: load it for mechanistic analyses (`mechanism:` of the
     entry), not for answers. Raises TrapsError if weights, device, memory or library are missing, or if the checkpoint's
@@ -56,6 +60,10 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
     require_device(device)
     checkpoint = find_checkpoint(params)
     require_no_code(checkpoint)
+    if seed is not None:
+        device = _one_device() if device == SPREAD else device
+        name, params = f"{checkpoint.name}, random weights {seed}", params.model_copy(update=_UNQUANTISED)
+        checkpoint = replace(checkpoint, name=name, digest=digest([checkpoint.digest, seed]))
     loading_params = ("dtype", "quantisation", "nf4_skip", "attn_implementation", "template", "video")
     key = digest(
         [checkpoint.digest, str(checkpoint.folder), device, params.model_dump(mode="json", include={*loading_params})]
@@ -64,7 +72,7 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False) -> LocalModel:
         if key not in _LOADED:
             _make_room(checkpoint, params, device)
             require_memory(checkpoint, params.dtype, params.quantisation, device)
-            _LOADED[key] = _load(checkpoint, params, device)
+            _LOADED[key] = _load(checkpoint, params, device, seed)
         _LOADED.move_to_end(key)
         return _LOADED[key]
 
@@ -102,22 +110,26 @@ def require_device(device: str) -> None:
         )
 
 
-def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalModel:
+def _load(checkpoint: Checkpoint, params: LocalParams, device: str, seed: int | None) -> LocalModel:
     transformers = load_transformers()
     options = _precision(params, device)
     try:
         processor = transformers.AutoProcessor.from_pretrained(
             checkpoint.folder, local_files_only=True, trust_remote_code=False
         )
-        network, report = transformers.AutoModelForImageTextToText.from_pretrained(
-            checkpoint.folder,
-            attn_implementation=params.attn_implementation,
-            local_files_only=True,
-            trust_remote_code=False,  # otherwise transformers asks on the terminal, and a `y` runs the code
-            use_safetensors=True,
-            output_loading_info=True,
-            **options,
-        )
+        # Without `trust_remote_code=False` transformers asks on the terminal, and a `y` runs the code.
+        common = {"attn_implementation": params.attn_implementation, "trust_remote_code": False}
+        if seed is None:
+            network, report = transformers.AutoModelForImageTextToText.from_pretrained(
+                checkpoint.folder,
+                local_files_only=True,
+                use_safetensors=True,
+                output_loading_info=True,
+                **common,
+                **options,
+            )
+        else:
+            network, report = _random_network(checkpoint, seed, common | {"dtype": options["dtype"]}), {}
     except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
         message = " ".join(str(error).split())[:400]
         raise TrapsError(
@@ -125,7 +137,7 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
             f"image-text-to-text model ({type(error).__name__}: {message}); name a checkpoint of such a class, or save "
             "it again with this version"
         ) from error
-    unset = [*report["missing_keys"], *report["mismatched_keys"]]
+    unset = [*report.get("missing_keys", ()), *report.get("mismatched_keys", ())]
     if unset:
         raise TrapsError(
             f"checkpoint {checkpoint.name}: its files lack {count_noun(len(unset), 'weight')}, {unset[0]} first, which "
@@ -141,6 +153,23 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str) -> LocalMode
     elif device == "cpu":
         _require_packable(network, checkpoint.name)
     return LocalModel(network.eval().requires_grad_(False), processor, checkpoint, params, device)
+
+
+def _one_device() -> str:
+    import torch
+
+    return "cuda:0" if torch.cuda.is_available() else "cpu"
+
+
+def _random_network(checkpoint: Checkpoint, seed: int, options: dict[str, Any]) -> Any:
+    """Return a network of the checkpoint's class and configuration, initialised on the CPU by a seed."""
+    import torch
+
+    transformers = load_transformers()
+    config = transformers.AutoConfig.from_pretrained(checkpoint.folder, local_files_only=True, trust_remote_code=False)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return transformers.AutoModelForImageTextToText.from_config(config, **options)
 
 
 def _require_packable(network: Any, name: str) -> None:

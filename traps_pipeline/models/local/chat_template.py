@@ -6,11 +6,14 @@ The library's sandbox lets a template run no code of its own, but loop for ever 
 from __future__ import annotations
 
 import json
+import os
 import resource
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from multiprocessing import get_context
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Lock
@@ -29,8 +32,11 @@ def render(checkpoint: str, template: str, turns: Sequence[Mapping[str, Any]], v
     with _lock:
         try:
             if not _renderer:
-                ours, theirs = get_context("spawn").Pipe()
-                get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True).start()
+                ours, theirs = Pipe()
+                # No process of `multiprocessing`: that would run a caller's script once more, paid calls and all.
+                code = f"from {__name__} import _serve, Connection; _serve(Connection({theirs.fileno()}))"
+                path = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+                subprocess.Popen([sys.executable, "-c", code], pass_fds=[theirs.fileno()], env=path)
                 theirs.close()
                 _renderer.append(ours)
             _renderer[0].send_bytes(json.dumps(request).encode())

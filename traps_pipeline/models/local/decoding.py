@@ -57,10 +57,7 @@ def decode(
     steering: Steers | None,
     stopped: Callable[[], bool],
 ) -> tuple[list[list[int]], list[dict[int, float]]]:
-    """Return answers' tokens (greedy without `sampling`), and first-token log-probs.
-
-    Tokens after an answer's end are included.
-    """
+    """Return answers' tokens (greedy without `sampling`), also those after an end, and first-token log-probs."""
     import torch
 
     transformers, pad = load_transformers(), model.network.generation_config.pad_token_id

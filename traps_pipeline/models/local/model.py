@@ -142,8 +142,9 @@ class LocalModel:
         """
         text = self._render(system, user)
         marks = [round(1000 * float(time)) for time in times_s]
-        clock = {"total_num_frames": marks[-1] + 1, "fps": float(CLOCK_FPS), "frames_indices": marks,
-                 "duration": marks[-1] / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
+        total = shown_frames(marks)
+        clock = {"total_num_frames": total, "fps": float(CLOCK_FPS), "frames_indices": marks,
+                 "duration": total / CLOCK_FPS, "height": frames.shape[1], "width": frames.shape[2]}  # fmt: skip
         bos = self.processor.tokenizer.bos_token
         with self._processing:
             inputs = self.processor(
@@ -312,6 +313,15 @@ class LocalModel:
         names = ("k_proj", "v_proj")
         widths = [module.out_features for name, module in self.blocks.named_modules() if name.endswith(names)]
         return sum(widths) or 2 * self.n_layers * self.d_model
+
+
+def shown_frames(marks: Sequence[int]) -> int:
+    """Return the frames of a clip of which these (N,) are shown, one in so many.
+
+    Classes that take one number for the step compute it as this over N (Qwen2.5-VL).
+    """
+    step = (marks[-1] - marks[0]) / (len(marks) - 1) if len(marks) > 1 else marks[-1] + 1
+    return max(1, round(len(marks) * step))
 
 
 def _first_token(tokens: int | Sequence[int]) -> int:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.local.capture import first_tensor
 from traps_pipeline.models.local.prompt_batches import Prompt, collate
-from traps_pipeline.models.local.sidepaths import has_other_paths
+from traps_pipeline.models.local.sidepaths import CACHE_NAMES, has_other_paths
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,7 +51,8 @@ def sharing_prompts(model: Any, prompts: Sequence[Prompt], last: int, pad_token:
             return forward(hidden_states, *args, **kwargs)
         layer = cache.layers[number]
         keys, values = (part[rows.to(part.device)] for part in (layer.keys, layer.values))
-        kwargs["past_key_values"].update(keys, values, number)
+        own_cache = next(kwargs[name] for name in CACHE_NAMES if kwargs.get(name) is not None)
+        own_cache.update(keys, values, number)
         return states[0][rows.to(states[0].device)] if number == last - 1 else hidden_states
 
     with ExitStack() as changes:

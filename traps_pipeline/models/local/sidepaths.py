@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torch.nn import Module
 
 Argument = Literal["shared_kv_states", "per_layer_input"]
+CACHE_NAMES = ("cache", "past_key_values")  # of the cache among a block's arguments: from transformers 5.24 on, before
 SHARED_KEYS: Argument = "shared_kv_states"
 PER_LAYER: Argument = "per_layer_input"
 # By configuration field: the blocks' argument for this path, and a description.
@@ -59,6 +60,11 @@ def with_argument(
     if place < len(args):
         return (*args[:place], value, *args[place + 1 :]), kwargs
     return args, kwargs | {name: value}
+
+
+def cache_argument(module: Module) -> str:
+    """Return the name of the cache among a model's arguments."""
+    return next(name for name in CACHE_NAMES if name in _arguments(type(module)))
 
 
 @cache

@@ -5,10 +5,17 @@ Means over a participant's ledger rows come first; without any, the registry's e
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from types import MappingProxyType
+from urllib.parse import urlsplit
 
+from traps_pipeline.base.digests import digest
+from traps_pipeline.base.files import write_text
+from traps_pipeline.base.network import is_loopback
+from traps_pipeline.base.paths import user_cache
 from traps_pipeline.ledger.rows import AVERAGED_COLUMNS, Totals
 from traps_pipeline.models.money.budget import BYTES_A_TOKEN, OVERHEAD_TOKENS
 from traps_pipeline.models.money.media_tokens import clip_tokens
@@ -18,6 +25,7 @@ TYPICAL_TEXT_BYTES = 1500  # system prompt, question and, for a judge, the answe
 # Of an entry without `expected_latency_s`: seconds to the first token of an answer, and completion tokens a second.
 FIRST_TOKEN_S, TOKENS_A_S = 4.0, 60.0
 TYPICAL_BYTES_A_TOKEN = 4
+_LATENCIES = "latencies.json"  # in the user's cache
 LOW_SHARE = 0.4  # share of the expected completion that a terse model takes
 
 
@@ -35,7 +43,8 @@ class Forecast:
     """The predicted cost of calls.
 
     Tokens are expected ones; dollars are low, expected, high, or None: unknown, never 0. minutes: of these calls alone;
-    paced_minutes: at the pace of their account, which all its calls share.
+    paced_minutes: at the pace of their account, which all its calls share. queued_minutes: if a server of this
+    machine takes one call at a time, as its live check measured; 0 if nothing says so.
     """
 
     participant: str
@@ -46,6 +55,7 @@ class Forecast:
     minutes: float
     account: str
     paced_minutes: float
+    queued_minutes: float = 0.0
     batch_price: float = 1.0  # cost of a batch call, relative to a live one
 
 
@@ -75,7 +85,10 @@ def forecast(entry: Entry, calls: int, seen: Experience, items: Mapping[str, int
     paced_minutes = [calls / account.requests_per_minute] if account.requests_per_minute else [0.0]
     if account.tokens_per_minute:
         paced_minutes.append(calls * (prompt + entry.max_tokens) / account.tokens_per_minute)
-    latency_s = seen.latency_s or entry.expected_latency_s or FIRST_TOKEN_S + completion / TOKENS_A_S
+    checked_s, queued_s = _latencies().get(_address(entry, account.base_url), (0.0, 0.0))
+    own_s = seen.latency_s or entry.expected_latency_s
+    latency_s = own_s or checked_s or FIRST_TOKEN_S + completion / TOKENS_A_S
+    is_here = is_loopback(urlsplit(account.base_url or "").hostname or "")
     waves = max(1.0, calls / entry.limits.concurrency) if calls else 0.0
     return Forecast(
         participant=entry.id,
@@ -86,8 +99,28 @@ def forecast(entry: Entry, calls: int, seen: Experience, items: Mapping[str, int
         minutes=max(waves * latency_s / 60, *paced_minutes),
         account=str(entry.account),
         paced_minutes=max(paced_minutes),
+        queued_minutes=calls * queued_s / 60 if is_here and not own_s else 0.0,
         batch_price=account.batch_price,
     )
+
+
+def remember_latencies(entry: Entry, base_url: str | None, seconds: Sequence[float]) -> None:
+    """Keep how long the calls of a live check took, which were sent at once, for plans of any study."""
+    means = sum(seconds) / len(seconds), max(seconds) / len(seconds)
+    with suppress(OSError):  # a plan can do without
+        write_text(user_cache() / _LATENCIES, json.dumps(_latencies() | {_address(entry, base_url): means}))
+
+
+def _latencies() -> dict[str, tuple[float, float]]:
+    """Return seconds by participant: of a call, and between two answers."""
+    with suppress(OSError, ValueError, TypeError, AttributeError):  # a damaged file counts as none
+        kept = json.loads((user_cache() / _LATENCIES).read_text(encoding="utf-8"))
+        return {name: (float(call), float(between)) for name, (call, between) in kept.items()}
+    return {}
+
+
+def _address(entry: Entry, base_url: str | None) -> str:
+    return digest([base_url, entry.provider_id])[:16]
 
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:

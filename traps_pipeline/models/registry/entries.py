@@ -207,6 +207,11 @@ class ModelEntry(Entry):
         """Return the validated `params` of backend local, or raise ValidationError."""
         return LocalParams.model_validate(self.params)
 
+    @property
+    def has_random_weights(self) -> bool:
+        """Whether states of the network with random weights are controls of its claims."""
+        return self.mechanism is None or self.mechanism.random_weights
+
     def inside_params(self) -> LocalParams:
         """Return the parameters for mechanistic analyses: `params` with their overrides."""
         params = self.local_params()
@@ -252,7 +257,8 @@ def _add(
             f"{path}: {what} ({name}): {', '.join(short_fields)}: an entry with an address of its own stands in an "
             "experiment's file (docs/models.md); one of the registry has backend, account and provider_id"
         )
-    entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context)
+    also = user_registry.SHORT_FIELDS if path != MODELS_FILE else ()
+    entry = parse_yaml_model(kind, raw, path, f"{what} ({name})", context, entry=str(name), also=also)
     if entry.id in entries:
         raise TrapsError(f"{path}: {what}: id {entry.id!r} occurs twice, here or in {MODELS_FILE.parent}")
     entries[entry.id] = entry
@@ -284,7 +290,10 @@ def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
         raise TrapsError(f"{path}: `accounts:` must be a mapping of names")
     if path == MODELS_FILE:
         accounts = {**accounts, **user_registry.accounts()}
-    return {name: parse_yaml_model(Account, raw or {}, path, f"account {name}") for name, raw in accounts.items()}
+    return {
+        name: parse_yaml_model(Account, raw or {}, path, f"account {name}", entry=name)
+        for name, raw in accounts.items()
+    }
 
 
 def account_of(entry: Entry) -> Account:
@@ -341,6 +350,11 @@ def is_reference(model_id: str) -> bool:
     """Return whether a model, or model@submission, is one that rules can judge."""
     models, name = load_models(), model_id.partition("@")[0]
     return name in models and models[name].backend in ("reference", "observer", "rule")
+
+
+def reference_rows() -> list[str]:
+    """Return ids of the registry's strategies and rules: rows to compare with, which no text calls models."""
+    return [*filter(is_reference, load_models())]
 
 
 @user_registry.cached_registry

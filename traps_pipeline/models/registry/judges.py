@@ -67,12 +67,12 @@ class Judge(typing.Protocol):
 
     @property
     def id(self) -> str:
-        """The judge's name."""
+        """The judge's name in tables and panels."""
         ...
 
     @property
     def backend(self) -> str:
-        """The kind of backend."""
+        """Where the judge answers: over the network, by rules, or in a package's way."""
         ...
 
     @property
@@ -151,8 +151,11 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     if not name:
         raise TrapsError(f"no panel is named: {panel_advice(path)}")
     if name not in panels:
-        raise TrapsError(f"{path}: no panel {name!r}; it has {', '.join(panels)}{did_you_mean(name, panels)}")
+        place = "" if path == JUDGES_FILE else f"{path}: "  # an experiment names its own file and line
+        raise TrapsError(f"{place}no panel {name!r}; there are {', '.join(panels)}{did_you_mean(name, panels)}")
     seats = panels[name]
+    own_files = [file for file, own in user_registry.sources() if name in own.panels] if path == JUDGES_FILE else []
+    path = own_files[-1] if own_files else path
     is_valid = isinstance(seats, list) and len(seats) == len(set(seats)) and len(seats) in PANEL_SIZES
     if not is_valid or any(seat not in judges for seat in seats):
         sizes = " or ".join(map(str, PANEL_SIZES))
@@ -180,21 +183,21 @@ def panel_advice(path: Path = JUDGES_FILE) -> str:
     """Return instructions for a command without a panel."""
     return (
         f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "
-        f"({RULES_PANEL} is for reference models)"
+        f"({RULES_PANEL} is for reference strategies)"
     )
 
 
 def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -> None:
     """Raise TrapsError unless the panel is named, known, and allowed for these models.
 
-    Rules judge models other than reference models only if the user says so.
+    Rules judge models other than reference strategies only if the user says so.
     """
     load_panel(panel)
     other_models = [model for model in models if not is_reference(model)]
     if is_of_rules(panel) and other_models and not judged_by_rules:
         verb = " and others are" if len(other_models) > 5 else " are" if len(other_models) > 1 else " is"
         raise TrapsError(
-            f"panel {panel} is made for reference models, and {', '.join(other_models[:5])}{verb} none: "
+            f"panel {panel} is made for reference strategies, and {', '.join(other_models[:5])}{verb} none: "
             "name a panel of language models, or say --judged-by-rules (`judged_by_rules: true` in the experiment); "
             f"every table and page then says `{BY_RULES}`"
         )
@@ -230,5 +233,5 @@ def panel_names(panels: str) -> list[str]:
 
 
 def is_judged_by_rules(panels: str, model: str) -> bool:
-    """Return whether rules judged a non-reference model, by its rows' `panel` column."""
+    """Return whether rules judged a model, by its rows' `panel` column."""
     return any(map(is_of_rules, panel_names(panels))) and not is_reference(model)

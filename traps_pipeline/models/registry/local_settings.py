@@ -63,6 +63,10 @@ class MechanismSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     quantisation: Quantisation | None = None
     nf4_skip: tuple[str, ...] = ()
+    random_weights: bool = Field(
+        default=True,
+        description="also read the network with random weights, twice; false: claims lack it",
+    )
 
     @model_validator(mode="after")
     def _skips_are_of_nf4(self) -> MechanismSpec:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import datetime
 import os
 from collections.abc import Callable, Iterable, Mapping
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 from urllib.parse import urlsplit
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
+from traps_pipeline.base.network import is_loopback
 from traps_pipeline.base.yamlfile import explain, read_yaml
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
 
@@ -46,6 +46,9 @@ class UserRegistry(BaseModel):
     def _have_ids(cls, values: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if not all(isinstance(value.get("id"), str) for value in values):
             raise ValueError("each entry has an `id`, a word in lower case with hyphens")
+        names = [value["id"] for value in values]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"{twice[0]!r} is named twice; leave one out")
         for value in values:
             for name in SHORT_FIELDS[:2]:
                 if name in value and not (isinstance(value[name], str) and value[name].strip()):
@@ -124,7 +127,7 @@ def all_additions() -> UserRegistry:
 
 
 def accounts() -> Mapping[str, dict[str, Any]]:
-    """Return all added accounts."""
+    """Return the accounts of models that users described, by name."""
     return all_additions().all_accounts
 
 
@@ -168,7 +171,7 @@ def _entry_fields(raw: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     }
     if kind == "models":
         entry_fields |= {"media": _media(entry.get("media"))}
-    if "prices" not in entry_fields and _is_here(str(raw["base_url"])):
+    if "prices" not in entry_fields and is_loopback(urlsplit(str(raw["base_url"])).hostname or ""):
         entry_fields["prices"] = {"input": 0, "output": 0, "as_of": datetime.date.today().isoformat()}
     return entry_fields
 
@@ -184,12 +187,3 @@ def _media(media: Any) -> Any:
     if media is None:
         raise TrapsError(HOW_MEDIA)
     return {"profile": media, "fps": 5, "most": 25} if isinstance(media, str) else media
-
-
-def _is_here(address: str) -> bool:
-    """Return whether an address is this machine's, so that calls are free."""
-    host = urlsplit(address).hostname or ""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -103,7 +103,7 @@ def _excess_of_invalid(workspace: Workspace, key: str | None, output: StageOutpu
 @_stage(
     VOTES,
     parents=[of(items, by_dataset), responses, judges],
-    code="4",
+    code="5",
     cost="money",
     checks=[
         Check(

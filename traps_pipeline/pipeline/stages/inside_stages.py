@@ -8,7 +8,7 @@ from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
 from traps_pipeline.mechanism.probing_versions import patching_version, sentence_version
 from traps_pipeline.models.registry.entries import ModelEntry, local_models
 from traps_pipeline.pipeline.partitioning import EVERY, SAME
-from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys
+from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys, to_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
@@ -40,6 +40,20 @@ _GATED = these_keys(
 )
 
 
+def _with_random(key: str) -> list[str]:
+    """Return the extraction that is compared with states (of random weights, too) under its prompt."""
+    extraction = Extraction.parse(key)
+    return [Extraction(extraction.model, PROBE_PROMPT).key] if extraction.text == PROBE_PROMPT else []
+
+
+_COMPARED = [
+    _STATES,  # those of random weights are upstream of their probes
+    of(probes, to_keys(EXTRACTION, EXTRACTION, _with_random), need="some"),
+    of(probe_items, EVERY),
+    probing_settings,
+]
+
+
 @_source()
 def patching_settings(workspace: Workspace, key: str) -> str:
     """Return the version of patching's checkpoint, precision, prompt, pairs, sites."""
@@ -66,12 +80,16 @@ def _model_and_states(workspace: Workspace, key: str) -> "tuple[ModelEntry, Stor
     return model, StoredStates.of(workspace, extraction)
 
 
+def _is_trained(_: StudyPartitions, key: str) -> bool:
+    return Extraction.parse(key).weights_seed is None
+
+
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
-    code="2",
+    code="3",
     parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
-    wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
+    wants=lambda study, key: _is_trained(study, key) and Extraction.parse(key).prompt in study.probed_prompts,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return probes on raw inputs, the output margin and noise instead of states."""
@@ -89,8 +107,8 @@ def _is_gated(partitions: StudyPartitions, key: str) -> bool:
 
 _gates = partial(
     _stage,
-    code="2",
-    parents=[_STATES, of(probe_items, EVERY), of(probes, SAME), of(verdicts, _GATED, need="some"), probing_settings],
+    code="3",
+    parents=[*_COMPARED, of(verdicts, _GATED, need="some")],
     wants=_is_gated,
 )
 
@@ -107,15 +125,11 @@ def gate(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(gate_rows(workspace, *_model_and_states(workspace, key)))
 
 
-@_gates(tables.RISK_COVERAGE)
-def risk_coverage(workspace: Workspace, key: str) -> StageOutput:
-    """Return risk against coverage over four datasets, as a gate withholds answers."""
-    from traps_pipeline.mechanism.gating import curve_rows
-
-    return StageOutput(curve_rows(workspace, *_model_and_states(workspace, key)))
-
-
-@_stage(tables.LENS, parents=[_STATES, probing_settings])
+@_stage(
+    tables.LENS,
+    parents=[_STATES, probing_settings],
+    wants=_is_trained,
+)
 def lens(workspace: Workspace, key: str) -> StageOutput:
     """Return the output margin of stored states at every layer (final norm and head)."""
     from traps_pipeline.mechanism.lens import lens_rows
@@ -123,8 +137,17 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(lens_rows(workspace, *_model_and_states(workspace, key)))
 
 
+@_stage(tables.LEADS, parents=_COMPARED, wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT)
+def leads(workspace: Workspace, key: str) -> StageOutput:
+    """Return how states and rivals order each dataset's sides, of the model and its controls."""
+    from traps_pipeline.mechanism.leads import lead_rows
+
+    return StageOutput(lead_rows(workspace, *_model_and_states(workspace, key)))
+
+
 @_stage(
     tables.ITEM_SCORES,
+    code="2",
     parents=[_STATES, of(probes, SAME), of(verdicts, _GATED, need="none"), probing_settings],
     wants=_is_gated,
 )
@@ -143,6 +166,7 @@ def _has_sentences(partitions: StudyPartitions, key: str) -> bool:
 
 @_stage(
     tables.SENTENCES,
+    code="2",
     parents=[of(probe_items, EVERY, need="some"), of(responses, _GATED, need="some"), sentence_settings],
     wants=_has_sentences,
 )
@@ -166,7 +190,7 @@ def patching(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(patching_rows(workspace, *_model(workspace, key)))
 
 
-_of_effects = partial(stage, group=GROUP, parents=[steering_effects], wants=steers)
+_of_effects = partial(stage, code="2", group=GROUP, parents=[steering_effects], wants=steers)
 
 
 @_of_effects(tables.STEERING_NULLS)

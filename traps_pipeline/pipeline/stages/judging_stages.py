@@ -101,7 +101,7 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
         of(verdicts, _SAMPLED, need="none"),
         confabulation_protocol,
     ],
-    code="3",
+    code="4",
     cost="money",
     checks=[
         Check(

@@ -14,6 +14,7 @@ from traps_pipeline.mechanism.mechanism_rows import (
     PROBE_ITEMS,
     PROBES,
     STEERING_EFFECTS,
+    STEERING_FLUENCY,
     STEERING_SHARES,
     STEERING_VOTES,
     CosineRow,
@@ -42,7 +43,7 @@ from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, 
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
-from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, TIME_SWAPPED, taxonomy_of_category
+from traps_pipeline.protocol.datasets import ANSWERABLE, DATASETS, taxonomy_of_category
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
@@ -74,20 +75,16 @@ def steering_settings(workspace: Workspace, key: str) -> str:
     return versions.steering_version(workspace, key)
 
 
-def _probed_datasets(dataset: str) -> list[str]:
-    return [dataset, TIME_SWAPPED] if dataset == "chaotic" else [dataset]
-
-
 def steers(partitions: StudyPartitions, key: str | None) -> bool:
-    """Return whether the study steers models."""
-    return partitions.steers
+    """Return whether the study steers models, along directions of the model's own weights."""
+    return partitions.steers and (key is None or Extraction.parse(key).weights_seed is None)
 
 
 @_stage(
     PROBE_ITEMS,
-    code="2",
+    code="3",
     parents=[
-        of(items, to_keys(DATASET, PROBED, _probed_datasets)),
+        of(items, to_keys(DATASET, PROBED, lambda dataset: [dataset])),
         of(scene_specs, _OCCLUSION),
         of(videos, _OCCLUSION),
     ],
@@ -96,8 +93,7 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
 def probe_items(workspace: Workspace, dataset: str) -> StageOutput:
     """Return the clips and questions for which hidden states are extracted.
 
-    These are a dataset's items, occlusion's void clips with an answerable question, and chaotic's clips with the frame
-    times of the other side.
+    These are a dataset's items, and occlusion's void clips with an answerable question.
     """
     from traps_pipeline.mechanism.probe_items import probe_items as rows_of
 
@@ -190,7 +186,7 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
 
 @_stage(
     STEERING_TABLE,
-    code="4",
+    code="5",
     parents=[of(items, by_dataset), of(directions, EVERY, need="some"), of(steering_settings, schemes.by_steering)],
     scheme=schemes.STEERING,
     kinds=["parquet", "pytorch"],
@@ -212,7 +208,7 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
 
 @_stage(
     STEERING_VOTES,
-    code="4",
+    code="5",
     parents=[of(items, by_dataset), steering, judges],
     scheme=schemes.STEERING,
     cost="money",
@@ -226,6 +222,22 @@ def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[
         yield finished_cell.key, output
 
 
+@_stage(
+    STEERING_FLUENCY,
+    parents=[of(items, by_dataset), steering],
+    scheme=schemes.STEERING,
+    kinds=["parquet", "pytorch"],
+    cost="machine",
+)
+def steering_fluency(workspace: Workspace, key: str) -> StageOutput:
+    """Return how likely the unsteered model finds each steered answer."""
+    from traps_pipeline.mechanism.fluency import fluency_rows
+    from traps_pipeline.mechanism.stages import examined_model
+
+    cell = SteeringCell.parse(key)
+    return StageOutput(fluency_rows(workspace, examined_model(workspace, cell.evaluation.model), cell))
+
+
 def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFrame]":
     """Return the steered answers, and the votes on them."""
     from traps_pipeline.mechanism.shares import VOTE_COLUMNS
@@ -236,15 +248,15 @@ def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFram
 _STEERING_PARENTS = (of(steering, need="some"), of(steering_votes, need="some"))
 
 
-@_stage(STEERING_EFFECTS, code="3", parents=_STEERING_PARENTS, wants=steers)
+@_stage(STEERING_EFFECTS, code="4", parents=(*_STEERING_PARENTS, of(steering_fluency, need="some")), wants=steers)
 def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     """Return abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows
 
-    return effect_rows(*_answers_and_votes(workspace))
+    return effect_rows(*_answers_and_votes(workspace), workspace.tables.read_all(STEERING_FLUENCY))
 
 
-@_stage(STEERING_SHARES, code="4", parents=_STEERING_PARENTS, wants=steers)
+@_stage(STEERING_SHARES, code="5", parents=_STEERING_PARENTS, wants=steers)
 def steering_shares(workspace: Workspace, _: None) -> list[SteeringShareRow]:
     """Return abstention over the paths of a set, with intervals by scenario."""
     from traps_pipeline.mechanism.shares import share_rows

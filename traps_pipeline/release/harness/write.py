@@ -18,7 +18,7 @@ from traps_pipeline.models.registry.entries import PROTOCOL
 from traps_pipeline.models.registry.judges import RULES_PANEL, panel_id
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
-from traps_pipeline.protocol.regimes import PAPER_REGIMES
+from traps_pipeline.protocol.regimes import BY_NAME
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
@@ -75,7 +75,7 @@ def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS
         **{name: manifest[name] for name in ("name", "version", "canary", "versions")},
         "panel": panel_id(RULES_PANEL),
         "media": media.model_dump(mode="json", exclude_none=True),
-        "prompts": {row["name"]: row["text"] for row in prompts if row["role"] == SYSTEM},
+        "prompts": {row["name"]: row["text"] for row in prompts if row["role"] == SYSTEM and _is_of_text(row["name"])},
         "parameters": {name: value for name, (_, value) in PROTOCOL.items()},
         "items": digest(sorted(items)),
     }
@@ -163,18 +163,20 @@ traps_harness = ["*.json", "*.jsonl", "media/**"]
 """
 
 
-def _lmms(target: Path, about: Mapping[str, Any]) -> None:
-    """Write a task for each regime.
+def _is_of_text(regime: str) -> bool:
+    """Return whether a regime is scored by the text of its answers alone."""
+    return regime not in BY_NAME or not BY_NAME[regime].first_token
 
-    lmms-eval uses the items' path verbatim from the YAML, so the folder must not be moved.
-    """
+
+def _lmms(target: Path, about: Mapping[str, Any]) -> None:
+    """Write a task for each regime. lmms-eval uses its path as written, so the folder must not be moved."""
     write_text(
         target / LMMS / "utils.py", rewritten_source((_CODE / "release/harness/lmms_utils.py").read_text("utf-8"))
     )
     parameters = {"max_new_tokens": about["parameters"]["max_tokens"], "do_sample": True}
     parameters |= {name: about["parameters"][name] for name in ("temperature", "top_p")}
     less_is_better = ["other_effect", *(name for name, metric in METRIC_WORDS.items() if metric.less_is_better)]
-    for regime in PAPER_REGIMES:
+    for regime in about["prompts"]:
         task = {
             "task": f"traps_{regime}",
             "dataset_path": "json",

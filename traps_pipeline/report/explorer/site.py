@@ -24,10 +24,11 @@ import pyarrow.parquet as pq
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.held_out import refuse_held_out
+from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
+from traps_pipeline.people.recorded_certificates import certification_note, recorded_verdicts
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, UNPAIRED, sides_of
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
@@ -35,7 +36,7 @@ from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
 from traps_pipeline.protocol.two_events import LANES, lane_items
 from traps_pipeline.report.explorer.answer_shards import StudyAnswers, study_answers
 from traps_pipeline.report.explorer.scenario_words import certificate_phrases, closes_frame, intervention
-from traps_pipeline.report.leaderboard_page import TWO_WAY_COLUMNS, legend, provenance
+from traps_pipeline.report.leaderboard_page import OPTIONAL, TWO_WAY_COLUMNS, legend, provenance, shortfall
 from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
@@ -91,10 +92,7 @@ class SiteSummary:
 
 
 def site_files(workspace: Workspace) -> dict[str, bytes]:
-    """Return the explorer's files by path, for a folder beside the study's clips.
-
-    Raises TrapsError without items.
-    """
+    """Return the explorer's files by path, for a folder beside the study's clips. Raises TrapsError without items."""
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     return _files(workspace, answers, scenarios, {*_clip_names(answers.items, scenarios)}, "../", report=True)
 
@@ -106,7 +104,7 @@ def write_site(workspace: Workspace, folder: Path, *, clips: bool = True) -> Sit
     written last. clips: include clips, as hard links if the file system allows it, else as copies. Raises TrapsError if
     the folder holds something else, or the study has no items.
     """
-    refuse_held_out(workspace.root, "the explorer")
+    begin_publication(workspace.root, "the explorer")
     previous_files = _former_files(folder)
     answers, scenarios = study_answers(workspace), _scenarios(workspace)
     names = _clip_names(answers.items, scenarios) if clips else []
@@ -232,12 +230,18 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
             for m in METRIC_WORDS.values()
         ],
         "two_way_figures": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in TWO_WAY_COLUMNS],
+        "counts": [
+            {"field": column.field, "title": column.heading, "unit": column.unit}
+            for column, field in OPTIONAL.items()
+            if column.unit != "range" and any(value > 0 for value in board[field].astype(float))
+        ],
+        "shortfall": shortfall(board) if len(board) else "",
         "leaderboard": records(board),
         "two_way": records(printed.rows),
         "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in printed.columns],
         "two_way_notes": [*printed.notes],
         "people": records(human_row),
-        "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),
+        "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS), certification_note(workspace.tables)),
         "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *printed_by_paper]]),
         "legend": legend(board, two_way) if len(board) else {},
         "marks": MARKS,
@@ -249,7 +253,7 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
     """Return the data about scenarios on the pages of pairs, by scenario."""
     specs, videos = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
     clips = {(row["scenario_id"], row["side"]): row for row in records(videos)}
-    rows = []
+    rows, people = [], recorded_verdicts(workspace.tables)
     for spec in sorted(specs.to_dict("records"), key=lambda row: row["scenario_id"]):
         twin, evidence = json.loads(spec["twin"]), json.loads(spec["evidence"])
         control_clip, twin_clip = (clips.get((spec["scenario_id"], side)) for side in ("control", "twin"))
@@ -258,9 +262,10 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
                 "scenario_id": spec["scenario_id"],
                 "intervention": intervention(spec),
                 "labels": [*spec["labels"]],
-                "certificate": [words for _, words in certificate_phrases(evidence)],
-                "twin_answer": twin["ground_truth"],
-                "twin_clip": twin_clip["path"] if twin_clip else None,
+                "certificate": [words for _, words in certificate_phrases(evidence)]
+                + ([people[spec["scenario_id"]] or "certified by people"] if spec["scenario_id"] in people else []),
+                "twin_answer": None if evidence.get("twin_px") else twin["ground_truth"] or None,
+                "twin_clip": twin_clip["path"] if twin_clip and not evidence.get("twin_px") else None,
                 "fps": control_clip["fps"] if control_clip else None,
                 "shown_at": _seconds(closes_frame(spec), control_clip),
             }

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import families, family_colour, family_of, legend_key, looks
+from traps_pipeline.report.figures.looks import REFERENCE, families, family_colour, family_of, legend_key, looks
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
@@ -93,7 +94,7 @@ def _draw_models_key(figure: Figure, models: list[str]) -> None:
 def abs_rec_by_model(results: Results) -> Figure:
     """Return AbsRec of every model under standard (hollow) and guided (filled).
 
-    Datasets have equal weights; bars are the deviation over runs.
+    Datasets have equal weights; bars are the deviation over runs. Reference rows lie below a line.
     """
     overall = results.overall
     rows = overall.loc[overall["regime"].isin(PROMPTING) & overall["abs_rec"].notna()]
@@ -102,8 +103,10 @@ def abs_rec_by_model(results: Results) -> Figure:
         raise NotRun(reason)
     sides: dict[tuple[str, str], Any] = {(r["model"], r["regime"]): r for r in rows.to_dict("records")}
     models = sorted(
-        {m for m, _ in sides}, key=lambda m: (_abs_rec(sides, m, "standard"), _abs_rec(sides, m, "guided"), m)
+        {m for m, _ in sides},
+        key=lambda m: (not is_reference(m), *(_abs_rec(sides, m, regime) for regime in PROMPTING), m),
     )
+    n_references = sum(map(is_reference, models))
     look = looks(models)
     with figure_style():
         figure = new_figure(COLUMN_IN, 0.75 + 0.155 * len(models))
@@ -113,8 +116,7 @@ def abs_rec_by_model(results: Results) -> Figure:
             percentages = [100 * sides[model, r]["abs_rec"] for r in PROMPTING if (model, r) in sides]
             axes.plot(percentages, [k] * len(percentages), color=colour, linewidth=0.9, zorder=2)
             for regime, face in (("standard", "white"), ("guided", colour)):
-                row = sides.get((model, regime))
-                if row is None:
+                if (row := sides.get((model, regime))) is None:
                     continue
                 spread = row.get("abs_rec_std")
                 width = 100 * spread if isinstance(spread, float) and spread == spread else 0
@@ -127,7 +129,11 @@ def abs_rec_by_model(results: Results) -> Figure:
         axes.set_yticks(range(len(models)), names)
         axes.set(xlim=(-2, 102), ylim=(-0.7, len(models) - 0.3), xticks=PERCENT)
         axes.set_xlabel("AbsRec, mean over datasets, %")
-        axes.set_title("hollow: standard, filled: guided", weight="normal", size=7)
+        title = "hollow: standard, filled: guided"
+        if n_references:
+            axes.axhline(n_references - 0.5, color=SOFT, linewidth=0.6)
+            title += f"\nbelow the line: {REFERENCE}"
+        axes.set_title(title, weight="normal", size=7)
         axes.grid(axis="x", color="#eaecf0", linewidth=0.6)
     return figure
 

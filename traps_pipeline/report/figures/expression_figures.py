@@ -1,104 +1,146 @@
-"""Draw encoding against expression: states and output by item, margin by layer."""
+"""Draw what is claimed of a model, states among their rivals, and the margin by layer."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.mechanism.probes import auroc
+from traps_pipeline.mechanism.control_rows import MODEL, RESIDUAL, STATES
 from traps_pipeline.protocol.datasets import SHORT
-from traps_pipeline.protocol.regimes import PROMPTING, STANDARD
+from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import legend_key
 from traps_pipeline.report.result_frames import Results, datasets_of
+from traps_pipeline.report.tables.claims import (
+    CLAIMS,
+    OTHER_GATES,
+    RANDOM,
+    SUBJECT_NAMES,
+    SUBJECTS,
+    Claim,
+    claim_frame,
+    lead_rows,
+)
 from traps_pipeline.report.tables.inside_columns import why
-from traps_pipeline.report.writing import COLOURS, INK, PAGE_IN, NotRun, figure_style, new_figure, plain
+from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.writing import (
+    COLOURS,
+    GRID,
+    INK,
+    PAGE_IN,
+    SOFT,
+    NotRun,
+    figure_style,
+    fraction,
+    new_figure,
+    plain,
+)
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CONTROL, VOID = COLOURS[0], COLOURS[1]
-SCORES = {"states": "states", "margin": "first token", "sentences": "whole abstentions"}  # names of `orders`
+HOLDS = "#b7e1cd"
 _LINES = dict(zip(PROMPTING, ("-", "--"), strict=True))
 
 
-def states_and_output(results: Results) -> Figure:
-    """Return every item by its scores from states and from output.
+def claims(results: Results) -> Figure:
+    """Return which claims hold of each model, and in which of its controls the same holds.
 
-    Both are read under the standard VQA prompt. Up: the score of a probe that has not seen the item's scenario, above
-    its threshold for voids. Right: log-odds that the answer begins with an abstention. A filled marker was answered
-    under standard, a hollow one abstained on. Orange filled markers above the line and left of it are encoded and not
-    expressed. Above each panel: how well each score separates voids from controls (AUROC), whole abstentions
-    against the model's own answer, and the floor of noise under the same split (mean and two deviations).
-    There is a gap in AUROC, too, only if states exceed the output by more than that.
+    A number is the figure of a claim; it is on colour where it reaches the claim's bound. A claim is held if it does so
+    in the model and in none of the controls that it must fail in, which are framed: the same network with random
+    weights (two seeds), answerable items in the place of voids (placebo), and a model that says all that it encodes.
     """
-    rows = scored_items(results)
+    rows = claim_frame(results)
     if not len(rows):
-        raise NotRun(why(results, "the paper prints no scores of items"))
-    models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)
+        raise NotRun(why(results, "the paper has no such controls"))
+    models, by_name = list(dict.fromkeys(rows["model"])), {claim.name: claim for claim in CLAIMS}
     with figure_style():
-        figure = new_figure(PAGE_IN, 0.6 + 2.1 * len(models))
-        axes = figure.subplots(len(models), len(datasets), squeeze=False, sharey="row")
-        for line, model in zip(axes, models, strict=True):
-            for ax, dataset in zip(line, datasets, strict=True):
-                part = rows.loc[(rows["model"] == model) & (rows["dataset"] == dataset)]
-                _scatter(ax, part)
-                figures = "\n".join(f"{SCORES[name]} {area:.2f}" for name, area in orders(part).items())
-                title = f"{plain(str(model))[:20]}: {SHORT[dataset]}, n {len(part)}\n{figures}"
-                ax.set_title(title + _floor(results, str(model), dataset), size=6)
-            line[0].set_ylabel("states: log-odds of void")
-        for ax in axes[-1]:
-            ax.set_xlabel("output: log-odds of abstaining", size=7)
+        figure = new_figure(PAGE_IN, 0.7 + 0.2 * len(CLAIMS) * len(models) + 0.3 * len(models))
+        panels = figure.subplots(len(models), 1, squeeze=False)[:, 0]
+        for ax, model in zip(panels, models, strict=True):
+            part = rows.loc[rows["model"] == model].to_dict("records")
+            for y, row in enumerate(part):
+                _claim_row(ax, y, row, by_name[row["claim"]])
+            ax.set_yticks(range(len(part)), [f"{by_name[row['claim']].says}" for row in part], size=6.5)
+            ax.set_xticks(range(len(SUBJECTS)), [SUBJECT_NAMES[name] for name in SUBJECTS], size=6.5)
+            ax.xaxis.tick_top()
+            ax.set(xlim=(-0.5, len(SUBJECTS) + 1.9), ylim=(len(part) - 0.5, -0.5))
+            ax.tick_params(length=0)
+            ax.spines[:].set_visible(False)
+            n_held = sum(row["verdict"] == "holds" for row in part)
+            ax.set_title(f"{plain(str(model))[:40]}: {n_held} of {len(part)} claims are held", size=7.5)
+    return figure
+
+
+def _claim_row(ax: Axes, y: int, row: Mapping[Any, Any], claim: Claim) -> None:
+    from matplotlib.patches import Rectangle
+
+    for x, subject in enumerate(SUBJECTS):
+        value = row[f"in_{subject}"]
+        figure = np.nan if value is None else float(value)
+        is_known, reaches = bool(np.isfinite(figure)), figure >= claim.bound
+        must_fail = subject in claim.fails_in
+        face = (VOID if must_fail else HOLDS if subject == MODEL else GRID) if reaches else "white"
+        edge = INK if must_fail and is_known else GRID
+        ax.add_patch(Rectangle((x - 0.44, y - 0.42), 0.88, 0.84, facecolor=face, edgecolor=edge, linewidth=0.7))
+        ax.text(x, y, fraction(figure, 2) if is_known else "–", ha="center", va="center", size=6.5)
+    held = row["verdict"] == "holds"
+    ax.text(len(SUBJECTS) - 0.4, y, row["verdict"][:60], va="center", size=6.5, color=INK if held else SOFT,
+            weight="bold" if held else "normal")  # fmt: skip
+
+
+def leads(results: Results) -> Figure:
+    """Return how well states tell each dataset's voids from controls, among their rivals.
+
+    AUROC of probes of the other datasets. Black: the model's states, with their 95 % interval; hollow: without what is
+    linear in words, pixels and length. Coloured: the same probe on what anybody sees, and on the model's output. Grey:
+    states of the same network with random weights; crosses: answerable items in the place of the voids. The model knows
+    of a dataset what no rival tells only where the black dot is right of all other marks.
+    """
+    rows = lead_rows(results)
+    if not len(rows):
+        raise NotRun(why(results, "the paper has no such rivals"))
+    models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows.assign(dataset=rows["target"]))
+    rivals = [name for name in OTHER_GATES if name in rows and name not in ("first frame", "time stamps")]
+    with figure_style():
+        figure = new_figure(PAGE_IN, 0.8 + 1.5 * len(models))
+        panels = figure.subplots(len(models), 1, squeeze=False)[:, 0]
+        for ax, model in zip(panels, models, strict=True):
+            for y, dataset in enumerate(datasets):
+                part = rows.loc[(rows["model"] == model) & (rows["target"] == dataset)]
+                for row in part.to_dict("records"):
+                    _lead_marks(ax, y, row, rivals)
+            ax.axvline(0.5, color=GRID, linewidth=0.8, zorder=0)
+            ax.set_yticks(range(len(datasets)), [TITLES[name].lower() for name in datasets])
+            ax.set(xlim=(0, 1.03), ylim=(len(datasets) - 0.4, -0.6), title=plain(str(model))[:40])
+        panels[-1].set_xlabel("AUROC of voids against controls (0.5: chance)")
         handles = [
-            legend_key(f"{side}, {word}", colour, "o", markerfacecolor=face or colour)
-            for side, colour in (("void", VOID), ("control", CONTROL))
-            for word, face in (("answered", ""), ("abstained", "white"))
+            legend_key("states", INK, "o", "-"),
+            legend_key("states, residual", INK, "o", markerfacecolor="white"),
         ]
+        handles += [legend_key(name, colour, marker) for name, colour, marker in _rival_looks(rivals)]
+        handles += [legend_key("random weights", SOFT, "v"), legend_key("placebo", VOID, "x")]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
 
-def scored_items(results: Results) -> pd.DataFrame:
-    """Return items with both scores, and `sentence`.
-
-    `sentence`: by how much an abstention is likelier than the model's own answer (nats per token, or NaN).
-    """
-    rows, sentence_rows = results.item_scores, results.sentences
-    sentence_rows = sentence_rows.loc[sentence_rows["prompt"] == STANDARD, ["model", "item_id", "abstention", "own"]]
-    sentence_rows = sentence_rows.assign(
-        sentence=sentence_rows["abstention"].astype(float) - sentence_rows["own"].astype(float)
-    )
-    rows = rows.merge(sentence_rows[["model", "item_id", "sentence"]], on=["model", "item_id"], how="left")
-    return rows.loc[rows["margin"].notna() & rows["own"].notna()].reset_index(drop=True)
+def _rival_looks(rivals: Sequence[str]) -> list[tuple[str, str, str]]:
+    return [*zip(rivals, COLOURS, ("s", "^", "D", "P", "*"), strict=False)]
 
 
-def orders(rows: pd.DataFrame) -> dict[str, float]:
-    """Return the AUROC of states, margin and, if all are known, whole sentences."""
-    void, areas = (rows["side"] == "void").to_numpy(), dict[str, float]()
-    for name, column in (("states", "own"), ("margin", "margin"), ("sentences", "sentence")):
-        values = rows[column].to_numpy(float)
-        if np.isfinite(values).all():
-            areas[name] = float(auroc(void, values))
-    return areas
-
-
-def _floor(results: Results, model: str, dataset: str) -> str:
-    rows = results.baselines
-    rows = rows.loc[(rows["features"] == "noise") & (rows["analysis"] == "held_out") & (rows["model"] == model)]
-    rows = rows.loc[(rows["source"] == dataset) & (rows["target"] == dataset)]
-    noise = [(float(mean), float(spread)) for mean, spread in zip(rows["value"], rows["spread"], strict=True)]
-    return f"\nnoise {noise[0][0]:.2f} ± {2 * noise[0][1]:.2f}" if noise else ""
-
-
-def _scatter(ax: Axes, rows: pd.DataFrame) -> None:
-    for line in (ax.axhline, ax.axvline):
-        line(0, color=INK, linewidth=0.6, zorder=0.5)
-    for side, colour in (("control", CONTROL), ("void", VOID)):
-        for abstained, face in ((False, colour), (True, "white")):
-            part = rows.loc[(rows["side"] == side) & rows["abstained_standard"].fillna(False).eq(abstained)]
-            ax.scatter(part["margin"], part["own"], s=12, facecolors=face, edgecolors=colour, linewidths=0.7, zorder=3)
+def _lead_marks(ax: Axes, y: int, row: Mapping[Any, Any], rivals: Sequence[str]) -> None:
+    if row["subject"] != MODEL:
+        marker, colour, dy = ("v", SOFT, 0.24) if row["subject"] in RANDOM else ("x", VOID, 0.34)
+        ax.plot(row[STATES], y + dy, marker, color=colour, markersize=4, clip_on=False)
+        return
+    ax.plot([row["low"], row["high"]], [y - 0.25, y - 0.25], color=INK, linewidth=0.9)
+    ax.plot(row[RESIDUAL], y - 0.1, "o", color=INK, markerfacecolor="white", markersize=4.5, clip_on=False)
+    for name, colour, marker in _rival_looks(rivals):
+        ax.plot(row[name], y + 0.08, marker, color=colour, markersize=4, clip_on=False, zorder=3)
+    ax.plot(row[STATES], y - 0.25, "o", color=INK, markersize=5, clip_on=False, zorder=4)
 
 
 def lens(results: Results) -> Figure:

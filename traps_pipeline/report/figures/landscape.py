@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
 from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
@@ -41,16 +42,19 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     """Return J (x) against Acc (y) of every model with iso-PECS contours.
 
     points has the columns model, regime, acc, j, pecs, incomplete. Hollow is standard, filled guided, a dot json; thin
-    bars are 95 % intervals. The dashed line is the frontier under guided, a ring each family's best PECS under guided.
+    bars are 95 % intervals. The dashed line is the models' frontier under guided, a ring each family's best PECS under
+    guided. Reference rows are grey.
     PECS is averaged per run and dataset, so it can differ from the contours. Coinciding points share one label.
     """
     points = points.loc[points["acc"].notna() & points["j"].notna()]
+    if not len(points):
+        raise NotRun("no model has both Acc and J, since too few of its answers are decided")
     with figure_style():
         figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
         labels = merge_labels(_draw_models(axes, points), axes)
-        guided = points.loc[points["regime"] == GUIDED]
+        guided = points.loc[points["regime"].eq(GUIDED) & ~points["model"].isin(reference_rows())]
         _draw_frontier(axes, guided)
         _draw_rings(axes, guided)
         _draw_key(figure)
@@ -144,9 +148,9 @@ def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
 
 def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
     families = guided["model"].map(family_of)
-    for family, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
+    for _, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
         best = rows.loc[rows["pecs"].idxmax()]
-        if family != "reference" and best["pecs"] > 0:
+        if best["pecs"] > 0:
             axes.scatter(
                 best["j"], best["acc"], s=75, facecolors="none", edgecolors=INK, linewidths=0.7, zorder=6, clip_on=False
             )

@@ -7,30 +7,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.models.registry.entries import load_models
-from traps_pipeline.report.writing import COLOURS, GRID, MARKERS, SOFT
+from traps_pipeline.models.registry.entries import is_reference, load_models
+from traps_pipeline.report.writing import COLOURS, GRID, MARKERS, REFERENCE_ROWS, SOFT
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-OWN, REFERENCE = "own", "reference"
+OWN, REFERENCE = "own", REFERENCE_ROWS.lower()
 
 
 def family_of(model: str) -> str:
-    """Return a model's family in the registry, or `own` if it is not there."""
+    """Return a model's family in the registry, or `own` if it is not there; REFERENCE of all reference rows."""
     entry = load_models().get(model)
-    return entry.groups.family if entry else OWN
+    return OWN if not entry else REFERENCE if is_reference(model) else entry.groups.family
 
 
 def families() -> list[str]:
-    """Return all families: the paper's, then the registry's others, then `own`."""
-    model_groups = [entry.groups for entry in load_models().values()]
-    order = [g.family for g in model_groups if g.group != "reference"] + [
-        g.family for g in model_groups if g.group == "reference"
-    ]
-    return list(dict.fromkeys([*order, OWN]))
+    """Return all families: the paper's, then the registry's others, REFERENCE and OWN."""
+    order = dict.fromkeys(map(family_of, load_models()))
+    return [*(name for name in order if name != REFERENCE), REFERENCE, OWN]
 
 
 def family_colour(family: str) -> str:
@@ -40,11 +37,13 @@ def family_colour(family: str) -> str:
 
 
 def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Return each model's colour (its family's) and marker (13 differ per family)."""
-    model_names = dict.fromkeys([*load_models(), *sorted(set(models))])
+    """Return each model's colour (its family's) and marker (13 differ per family, and among these reference rows)."""
+    models = set(models)
+    model_names = dict.fromkeys([*load_models(), *sorted(models)])
+    model_names = [name for name in model_names if name in models or not is_reference(name)]
     colours = {model: family_colour(family_of(model)) for model in model_names}
     models_by_colour = {colour: [m for m in model_names if colours[m] == colour] for colour in COLOURS}
-    return {m: (colours[m], MARKERS[models_by_colour[colours[m]].index(m) % len(MARKERS)]) for m in set(models)}
+    return {m: (colours[m], MARKERS[models_by_colour[colours[m]].index(m) % len(MARKERS)]) for m in models}
 
 
 def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
@@ -98,7 +97,9 @@ def legend_key(label: str, colour: str, marker: str = "", line: Any = "none", si
 
 
 def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colour: str) -> None:
-    """Draw a thin arrow between two markers' rims."""
+    """Draw a thin arrow between two markers' rims; none where either is undefined."""
+    if not np.isfinite([*start, *end]).all():
+        return  # matplotlib's arrow raises StopIteration while the figure is saved
     style = {"arrowstyle": "-|>,head_width=0.12,head_length=0.25", "color": colour, "linewidth": 0.8}
     style |= {"shrinkA": 2.5, "shrinkB": 2.5, "mutation_scale": 10}
     axes.annotate("", end, start, arrowprops=style, zorder=2.5, annotation_clip=False)

@@ -229,7 +229,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
         Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("separable", "Separable"),
         *COUNTS, Column("refused", "Refused"),
     ]  # fmt: skip
-    notes = ["left minus right; the other figures and datasets are in the workspace's table `contrasts`"]
+    notes = ["left minus right; the other metrics and datasets are in the workspace's table `contrasts`"]
     if TOO_FEW in set(rows["separable"]):
         notes.append(f"{TOO_FEW}: no answers to so few scenarios could differ significantly")
     notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []

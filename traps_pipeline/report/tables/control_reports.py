@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
-from traps_pipeline.protocol.datasets import DATASETS, SHORT, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import (
@@ -14,14 +13,12 @@ from traps_pipeline.report.tables.inside_columns import (
     INFERENCE,
     LAYER,
     PATH,
-    PROBE_KEY,
-    SHORTCUTS,
     SIDES,
     best_baselines,
-    by_features,
     few_marks,
     few_note,
     interval,
+    joined_notes,
     path_names,
     short_names,
     why,
@@ -34,108 +31,6 @@ if TYPE_CHECKING:
 
 DOSE = Column("step", "Dose")
 SIGNS = {"label": "+ controls, − voids", "plus": "+ everywhere", "minus": "− everywhere"}
-
-
-# --- probes and their baselines ---------------------------------------------------------------------------------------
-
-SOURCE_WORDS = {
-    "occlusion_answerable": "void clip, answerable question",
-    "length_matched": "whole clip as short as a void",
-    "chaotic_time_swapped": "frame times of the other side",
-}
-
-
-def probe_baselines(results: Results) -> list[PrintedTable]:
-    """Return the probe beside raw inputs, margin and noise; also on look-alikes."""
-    return [_baseline_table(results), _look_alikes(results)]
-
-
-def beside(results: Results) -> pd.DataFrame:
-    """Return the probe's score and each baseline, by model and pair of datasets.
-
-    Pairs include a dataset on itself. The figure is at the target's chosen layer, with its interval. Within a taxonomy
-    all are fitted without the scored scenario (`held_out`), otherwise on all of the source (`transfer`).
-    """
-    import pandas as pd
-
-    target_layers = pd.DataFrame(
-        [(s, t, "held_out" if taxonomy_of(s) == taxonomy_of(t) else "transfer") for s in DATASETS for t in DATASETS],
-        columns=pd.Index(["source", "target", "analysis"]),
-    )
-    probe = results.probes.loc[results.probes["chosen"].eq(True)]
-    return _with_baselines(results, probe.merge(target_layers, on=["source", "target", "analysis"]))
-
-
-def look_alikes(results: Results) -> pd.DataFrame:
-    """Return `beside` for look-alikes of voids, by probes of their own taxonomy."""
-    probe = results.probes.loc[results.probes["chosen"].eq(True) & results.probes["target"].isin([*SOURCE_WORDS])]
-    is_own_taxonomy = [
-        taxonomy_of(s) == probed_taxonomy(t) for s, t in zip(probe["source"], probe["target"], strict=True)
-    ]
-    return _with_baselines(results, probe.loc[is_own_taxonomy])
-
-
-def _with_baselines(results: Results, probe: pd.DataFrame) -> pd.DataFrame:
-    probe = (probe if len(results.baselines) else probe.head(0)).astype({"prompt": object})
-    states = probe[[*PROBE_KEY, "layer", "value", "low", "high", "n_voids", "n_controls"]]
-    table = states.merge(by_features(results), on=PROBE_KEY, how="left")
-    return table.assign(mark=few_marks(table, "n_voids", "n_controls"))
-
-
-_PROBE = (LAYER, Column("value", "States", "fraction", mark="mark"), *interval())
-_BASELINES = (
-    *(Column(name, name.capitalize(), "fraction") for name in SHORTCUTS),
-    Column("output margin", "Output margin", "fraction"),
-    Column("noise", "Noise", "fraction", spread="noise_spread"),
-)
-_NOTES = (
-    "AUROC of the same protocol on other features than states; the layer is chosen on pairs of other datasets than "
-    "the target (probe_layers)",
-    "output margin: log-odds that the first answer token begins an abstention; noise: random vectors as wide as "
-    "states, mean ± deviation over draws, the floor of the split",
-    "a probe shows understanding only as far as it is above the raw inputs, and a gap between states and output only "
-    "as far as it is above the output margin",
-)
-
-
-def _baseline_table(results: Results) -> PrintedTable:
-    rows = beside(results)
-    rows = rows.assign(path=path_names(rows))
-    columns = [MODEL, PATH, *_PROBE, *_BASELINES, *SIDES]
-    notes = [
-        *_NOTES,
-        "pairs within a taxonomy and a dataset on itself: fitted without the scored scenario, controls included",
-        *few_note(rows),
-    ]
-    reason = why(results, "the paper has no such baselines")
-    title = "Probes beside their baselines"
-    return PrintedTable("probe_baselines", title, rows, columns, notes, reason, deviation=DRAWS)
-
-
-def _look_alikes(results: Results) -> PrintedTable:
-    rows = look_alikes(results)
-    table_rows = rows.assign(
-        what=[SOURCE_WORDS[name] for name in rows["target"]],
-        against=[OPPOSITES[name] for name in rows["analysis"]],
-        path=short_names(rows["source"]),
-    )
-    columns = [
-        MODEL, Column("what", "Items"), Column("against", "Told apart from"), Column("path", "Source"), *_PROBE,
-        *_BASELINES, *SIDES,
-    ]  # fmt: skip
-    notes = [
-        *_NOTES[:2],
-        "told apart from voids: 1 for a probe that detects what cannot be known, 0.5 for one that detects what both "
-        "have; from controls: the reverse",
-        "frame times of the other side: 1 for a probe that reads the frames, 0 for one that reads the time stamps",
-        *few_note(rows),
-    ]
-    reason = why(results, "the paper has no such items")
-    title = "What only looks like a void"
-    return PrintedTable("probe_look_alikes", title, table_rows, columns, notes, reason, deviation=DRAWS)
-
-
-OPPOSITES = {"answerable_void": "voids", "answerable_control": "controls", "time_swapped": "its other side"}
 
 
 # --- steering ---------------------------------------------------------------------------------------------------------
@@ -226,7 +121,7 @@ SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 def gate(results: Results) -> list[PrintedTable]:
     """Return PECS before and after gates and prompts, by source, threshold, features."""
-    return [_gate_sources(results), _gate_controls(results), _gate_answerable(results), _prompts(results)]
+    return [_gate_sources(results), _prompts(results)]
 
 
 _GATED = (
@@ -268,44 +163,11 @@ def _gate_sources(results: Results) -> PrintedTable:
         *_GATE_NOTES,
         "mid: half-way between the means of the sides; J: the cut with the largest J on unseen source items; "
         "conformal: at most 5 % of new source controls in expectation, or as the experiment says",
+        *joined_notes(rows),
         *few_note(rows),
     ]
     reason = why(results, "the paper gates nothing")
     return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, reason)
-
-
-def _gate_controls(results: Results) -> PrintedTable:
-    rows = _gates(results)
-    for name, value in (DEFAULT_GATE | {"target": "all"}).items():
-        rows = rows.loc[rows[name] == value]
-    columns = [MODEL, Column("regime", "Answers"), Column("features", "Features"), *_GATED]
-    notes = [
-        "gates from other datasets at the mid threshold, mean over the four datasets",
-        "a gate on states shows what states add only as far as it is above gates on raw inputs, on the output margin "
-        "and on an untrained model’s states",
-        *few_note(rows),
-    ]
-    reason = why(results, "the paper gates nothing")
-    return PrintedTable("gate_controls", "The gate beside its controls", rows, columns, notes, reason)
-
-
-def _gate_answerable(results: Results) -> PrintedTable:
-    rows = _gates(results)
-    rows = rows.loc[~rows["target"].isin([*SHORT, "all"]) & (rows["source"] == DEFAULT_GATE["source"])]
-    rows = rows.loc[rows["target"].isin([*SOURCE_WORDS]) & (rows["target"] != "chaotic_time_swapped")]
-    rows = rows.drop_duplicates(["model", "features", "threshold", "target"])  # gates know no regime here
-    rows = rows.assign(what=[SOURCE_WORDS[name] for name in rows["target"]], mark=few_marks(rows, "n_controls"))
-    columns = [
-        MODEL, Column("features", "Features"), Column("threshold", "Threshold"), Column("what", "Items"),
-        Column("false_abs", "Abstained on %", "percent", mark="mark"),
-        Column("expected_false_abs", "expected %", "percent"), Column("n_controls", "n", "count"),
-    ]  # fmt: skip
-    notes = [
-        "all of these items can be answered, so that every abstention of a gate is a false one",
-        *few_note(rows, of="items"),
-    ]
-    reason = why(results, "the paper gates nothing")
-    return PrintedTable("gate_answerable", "The gate on items that can be answered", rows, columns, notes, reason)
 
 
 def prompts(results: Results) -> pd.DataFrame:
@@ -361,9 +223,10 @@ def _prompts(results: Results) -> PrintedTable:
         "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
         "states under the VQA prompt of that name, fitted without the scored scenario); the best raw input and noise "
         "are the same under both prompts",
-        _NOTES[1],
+        "output margin: log-odds that the first answer token begins an abstention; noise: random vectors as wide as "
+        "states, mean ± deviation over draws, the floor of the split",
         *few_note(rows, "said_mark", "probe_mark"),
     ]
-    reason = why(results, "the paper prints no such figures")
+    reason = why(results, "the paper prints no such numbers")
     title = "What the prompt changes, in answers and in states"
     return PrintedTable("prompt_gate", title, rows, columns, notes, reason, deviation=DRAWS)

@@ -48,7 +48,7 @@ def _notes(rows: pd.DataFrame) -> list[str]:
         "regret: points that the ideal observer earns more: with the likeliest answer, without answers that are not "
         "worth their risk (rash), with those that are (shy)",
         f"Brier: of probabilities that are stated or those of the first token, from 0 to 2; the posterior has "
-        f"{figures['brier_ideal']}, equal probabilities {figures['brier_even']}; all other figures are then of acting "
+        f"{figures['brier_ideal']}, equal probabilities {figures['brier_even']}; all other numbers are then of acting "
         f"on them: answering the largest from {ANSWER_FROM:g} on",
-        "brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen; no part of any other figure",
+        "brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen; no part of any other number",
     ]

@@ -52,7 +52,7 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
         "interval, Bayesian bootstrap over scenarios with one unseen",
         "rules: occluder-rule, length-rule and wording-rule, each of which reads one cue and understands nothing; what "
         "a rule gets too, a model need not understand anything for; guess: Acc of a guess among the answers offered",
-        "no part of PECS or of the arms' figures",
+        "no part of PECS or of the arms' metrics",
     ]
     if any(dose.counts_as.startswith("no void") for dose in hypothesis.doses):
         notes.append(

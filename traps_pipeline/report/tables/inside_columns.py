@@ -58,6 +58,12 @@ def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> 
     return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if has_mark else []
 
 
+def joined_notes(rows: pd.DataFrame) -> list[str]:
+    """Return which models' rows join the states of one model with the answers of another."""
+    joined = rows.loc[rows["joins"].notna(), ["model", "joins"]].drop_duplicates()
+    return [f"{model} joins two models ({joins}): no claim reads its rows" for model, joins in joined.to_numpy()]
+
+
 def interval(prefix: str = "", unit: str = "fraction", digits: int | None = None) -> list[Column]:
     """Return the columns of the ends of an interval, `low` and `high` with a prefix."""
     return [

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from traps_pipeline.mechanism.layer_choice import ROUNDING, layer_choice, pair_curves
 from traps_pipeline.mechanism.transfer_paths import TRANSFER_PAIRS, path_name
-from traps_pipeline.protocol.datasets import SHORT, transfer_type
+from traps_pipeline.protocol.datasets import transfer_type
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import (
     BASELINE_NOTES,
@@ -47,7 +46,7 @@ def probes(results: Results) -> list[PrintedTable]:
         _means(results, pairs),
         _within_table(results),
     ]
-    return [*tables, _layers(results), _catch(results)]
+    return [*tables, _catch(results)]
 
 
 WHY_UNSHARED = "not computed; held out: these datasets share no controls and no scenarios"
@@ -137,7 +136,7 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
     ]  # fmt: skip
     notes = [
         "best layer: the highest AUROC on the target itself, as in the paper; chosen layer: where the other datasets’ "
-        "probes carry over best to each other, which uses no pair of the target (table of layers)",
+        "probes carry over best to each other, which uses no pair of the target",
         *_shared_controls(results),
         "from, to: 95 % interval from resampled scenarios of the target, with the probe held fixed",
         *baseline_notes(results),
@@ -165,7 +164,7 @@ def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         *baseline_notes(results),
         *few_note(rows, "cf_mark"),
     ]
-    reason = why(results, "the paper has these figures in its table of probe transfer")
+    reason = why(results, "the paper has these numbers in its table of probe transfer")
     if results.is_study and len(results.probes):
         reason = "; ".join(gap_notes) or reason
     title = "Probes on confabulated voids (Cf→Cf)"
@@ -334,50 +333,3 @@ def _caught_beside(results: Results) -> pd.DataFrame:
     for name, part in kinds.items():
         table = table.join(part[["void", "control"]].add_prefix(f"{name}_"), how="outer")
     return table.reset_index()
-
-
-def _layers(results: Results) -> PrintedTable:
-    table, notes = layer_curves(results.probes)
-    columns = [
-        MODEL, LAYER,
-        *(Column(name, f"without {short_name}", "fraction", mark=f"{name}_mark") for name, short_name in SHORT.items()
-          if name in table),
-        Column("n_at_top", "Own maxima", "count"),
-    ]  # fmt: skip
-    notes = [
-        "without a dataset: mean AUROC of the probes of the other datasets on each other, those of one taxonomy fitted "
-        "without the scored scenario; * the layer at which that dataset is read, the middle one of equal ones",
-        "own maxima: datasets whose own cross-validation is highest at this layer; a maximum that several layers share "
-        "chooses none of them",
-        *notes,
-    ]
-    reason = why(results, "the paper prints no curves")
-    return PrintedTable("probe_layers", "Layers chosen without the target’s labels", table, columns, notes, reason)
-
-
-def layer_curves(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """Return one row per model and layer, and a note per model on ties.
-
-    A row has, for each dataset, the mean AUROC of pairs of the others, marked at the chosen layer, and the number of
-    datasets whose own cross-validation is maximal there.
-    """
-    import pandas as pd
-
-    parts, notes = [pd.DataFrame(columns=pd.Index(["model", "layer", "n_at_top"]))], list[str]()
-    for model, group in rows.groupby("model", sort=False):
-        curves = pair_curves({str(name): value for name, value in row.items()} for row in group.to_dict("records"))
-        within_rows = group.loc[group["analysis"] == "within", ["source", "layer", "value"]]
-        if not curves or not len(within_rows):
-            continue
-        part = within_rows.assign(
-            top=within_rows["value"] >= within_rows.groupby("source")["value"].transform("max") - ROUNDING
-        )
-        part = part.groupby("layer")["top"].sum().rename("n_at_top").to_frame()
-        choices = {name: layer_choice(curves, name) for name in SHORT if name in set(within_rows["source"])}
-        for name, choice in choices.items():
-            part[name] = pd.Series(choice.curve)
-            part[f"{name}_mark"] = ["*" if layer == choice.layer else "" for layer in part.index]
-        parts.append(part.reset_index().assign(model=model))
-        tie_notes = [f"{SHORT[name]} {len(choice.tied)}" for name, choice in choices.items()]
-        notes.append(f"{model}: layers with the highest mean, by the dataset left out: {', '.join(tie_notes)}")
-    return pd.concat(parts, ignore_index=True), notes

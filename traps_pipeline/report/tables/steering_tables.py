@@ -152,7 +152,7 @@ def _domains(results: Results) -> PrintedTable:
     notes += _cell_notes(results)
     if results.is_study:
         notes.append(
-            "judged by the panel; the paper judged its two same-domain figures by keywords, which it does not print: "
+            "judged by the panel; the paper judged its two same-domain rates by keywords, which it does not print: "
             "no keyword judge here would be its own"
         )
     return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, why(results))

@@ -36,10 +36,9 @@ def certify_lane_record(spec: TwoEventsSpec, worlds: Mapping[str, np.ndarray]) -
     else:
         failures |= _contradictions(spec, world, twins, evidence)
     with Renderer(world.model, world.camera) as renderer:
-        ends = [frames_digest([*renderer.frames(world.clip(CLIPS[clip])[-1:])]) for clip in ("neither", "both")]
-    is_same = all(np.array_equal(each.simulated, each.qpos) for each in (world, *twins))
-    cpu_s = time.process_time() - start_s
-    return Verdict(spec.scenario_id, spec.family, failures, evidence, is_same, *ends, cpu_s=cpu_s)
+        seen, hidden = (frames_digest([*renderer.frames(world.clip(CLIPS[name])[-1:])]) for name in ("neither", "both"))
+    is_same, cpu_s = all(np.array_equal(each.simulated, each.qpos) for each in (world, *twins)), time.process_time()
+    return Verdict(spec.scenario_id, spec.family, failures, evidence, is_same, seen, hidden, cpu_s=cpu_s - start_s)
 
 
 def _contradictions(

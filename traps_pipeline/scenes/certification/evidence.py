@@ -42,7 +42,7 @@ class Claim:
 
     @staticmethod
     def of_record(spec: SceneSpec) -> Claim:
-        """Return a record's claims."""
+        """Return what a record claims, to be proved by its certificates."""
         physics = Physics(**spec.physics)
         return Claim(
             family=get_family(spec.family),

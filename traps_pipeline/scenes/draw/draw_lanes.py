@@ -85,8 +85,9 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
     pairs = [first, _event(family, rng, first[0].params, difficulty)][:: 1 if rng.integers(2) else -1]
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
     for k, pair in enumerate(pairs):  # which of its two worlds a lane shows is no matter of chance
-        place = [wording.labels.index(event.outcome.answer) for event in pair]
-        pairs[k] = pair if (place[0] < place[1]) == is_turn_of_earlier(family.name, number, k, seed) else pair[::-1]
+        one, other = (wording.labels.index(event.outcome.answer) for event in pair)
+        if (one < other) != is_turn_of_earlier(family.name, number, k, seed):
+            pairs[k] = pair[1], pair[0]
     assert look is not None
     if difficulty.distractors:
         pairs = [_with_distractors(pair, wording, difficulty, rng) for pair in pairs]
@@ -224,9 +225,8 @@ def _strips(wording: Wording, pairs: Pairs, rng: np.random.Generator) -> list[st
     in_view = {colour for event, _ in pairs for colour in event.scene.inventory.colours}
     for avoided in (in_view | named, named):
         free = [str(name) for name in rng.permutation([name for name in STRIPS if name not in avoided])]
-        pairs_of_colours = [[a, b] for a in free for b in free if a != b and {a, b} not in LOOK_ALIKE]
-        if pairs_of_colours:
-            return pairs_of_colours[0]
+        if two := [[a, b] for a in free for b in free if a != b and {a, b} not in LOOK_ALIKE]:
+            return two[0]
     raise Rejected("no two colours are left for the strips")
 
 

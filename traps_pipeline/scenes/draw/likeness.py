@@ -42,6 +42,6 @@ def lookalikes(hashes: Mapping[str, int]) -> dict[str, str]:
 
 
 def excess_lookalike(hashes: Mapping[str, int], new: int, count: int) -> str | None:
-    """Return the lookalike of a new hash if `count` records then have too many."""
+    """Return the record that a new clip resembles, if that is one lookalike too many among `count`."""
     pairs = lookalikes({**hashes, "new": new})
     return pairs.get("new") if len(pairs) > NEAR_SHARE * count else None

@@ -248,7 +248,7 @@ class Records:
 
 
 def save_tallies(released: Path, tallies: Mapping[str, Tally]) -> None:
-    """Write `draws.json`."""
+    """Write `draws.json`: how often each family was drawn and why draws were rejected."""
     notes = dict[str, dict[str, Any]]()
     for name, tally in tallies.items():
         notes[name] = {**vars(tally), "rejected": dict(tally.rejected), "difficulty": tally.difficulty.settings()}

@@ -150,7 +150,7 @@ class Course:
         return add_box(self.spec.worldbody, name, centre, half_size, colour, euler_y=angle)
 
     def slab(self, name: str, centre: Vec3, half: Vec3, colour: str, *, falls_rad: float = 0.0) -> mujoco.MjsGeom:
-        """Return a static box from its centre and half sizes, tilted along the way."""
+        """Return a static box from its centre and half sizes; falls_rad tilts it downhill."""
         at = (self.direction * centre[0], centre[1], centre[2])
         return add_box(self.spec.worldbody, name, at, half, colour, euler_y=self.direction * falls_rad)
 

@@ -28,7 +28,7 @@ def scenes_of_lane(frames: np.ndarray, strip: str) -> list[np.ndarray]:
     side = int(np.argmax([0 if blob is None else blob.area for blob in strips]))
     lane, strip_blob = halves[side], strips[side]
     boards = np.stack([colour_mask(frame, "navy") for frame in lane])
-    still = next(iter(blobs(boards.all(axis=0), BOARD_PX)), None)
+    still = next(iter(blobs(boards.min(axis=0), BOARD_PX)), None)
     if strip_blob is None or still is None:
         return []
     _, top, _, height = still.box
@@ -67,16 +67,12 @@ def _is_bench(background: np.ndarray, place: Blob) -> bool:
 
 
 def _cropped(lane: np.ndarray, background: np.ndarray, rows: slice, strip: Blob, side: int) -> np.ndarray:
-    """Return what is in some rows, over the length of the strip, on plain floor at an observer's size.
-
-    What is behind the strip lies nearer to the middle of the picture.
-    """
+    """Return what some rows show behind a strip (nearer to the middle of the picture), at an observer's size."""
     x, _, length, _ = strip.box
     width = min(round(MARGIN * length) + 8, lane.shape[2])
     outer = round((width - length) * (1 - INNER if side == 0 else INNER))
     left = int(np.clip(x - outer, 0, lane.shape[2] - width))
-    height = width * HEIGHT // WIDTH
-    bottom = min(max(rows.stop + 4, height), lane.shape[1])
+    bottom = min(max(rows.stop + 4, height := width * HEIGHT // WIDTH), lane.shape[1])
     shown = np.empty_like(lane)
     shown[:] = np.median(background[rows].reshape(-1, 3), axis=0).astype(np.uint8)
     shown[:, rows] = lane[:, rows]

@@ -53,10 +53,7 @@ def gl_version() -> str:
 
 
 def renderer_version() -> str:
-    """Return OpenGL's version and renderer, which decide pixels.
-
-    Raises RenderingUnavailable.
-    """
+    """Return OpenGL's version and renderer, which decide pixels. Raises RenderingUnavailable."""
     _make_current(WIDTH * SUPERSAMPLE, HEIGHT * SUPERSAMPLE)
     from OpenGL.GL import GL_RENDERER
 

@@ -15,7 +15,7 @@ from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scen
 if TYPE_CHECKING:
     import mujoco
 
-DOUBLES = 5  # at most
+DOUBLES = 3  # at most
 DOUBLES_SHARE = 0.5  # of the width of what is hidden, that they take at most
 
 

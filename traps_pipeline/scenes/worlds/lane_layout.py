@@ -85,6 +85,7 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[LaneEvent]]) -> t
     covers = [box_around([event.cover.corners() for event in events]).corners() for events in worlds]
     view = replace(worlds[0][0].scene.view, azimuth_deg=90.0)
     down = np.radians(-view.elevation_deg)
+    moves = [min(events, key=lambda event: event.outcome.answer) for events in worlds]  # whichever of both is shown
     benches = [_first_bench(lane.bench_above, shown, down) for lane, shown in zip(lanes, points, strict=True)]
     half = max(float(np.ptp(shown[:, 0])) for shown in points) / 2 + GAP_M / 2
     layouts: list[Layout] = []
@@ -95,7 +96,7 @@ def fit_lanes(lanes: Sequence[Lane], worlds: Sequence[Sequence[LaneEvent]]) -> t
         camera = fit_camera(view, np.concatenate([everything, everything * (-1, 1, 1)]), WideCamera)
         for k, lane in enumerate(lanes):
             board = fit_occluder(camera, box_around([covers[k] + shifts[k]]))
-            layouts.append(_layout(camera, lane, shown[k], board, shifts[k], benches[k], worlds[k][0]))
+            layouts.append(_layout(camera, lane, shown[k], board, shifts[k], benches[k], moves[k]))
             benches[k] = _moved_apart(camera, lane.bench_above, shown[k], layouts[-1], down)
         if len(layouts) == ROUNDS * len(SIDES):
             return camera, tuple(layouts[-2:])

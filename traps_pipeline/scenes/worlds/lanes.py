@@ -99,13 +99,16 @@ class TwoLanes:
     def _motion(self) -> Motion:
         return replay(self.model, self.qpos, self.physics)
 
-    def outcome(self, lane: int) -> Outcome:
-        """Return a lane's outcome, read by its family from its part of the motion."""
+    def motion(self, lane: int) -> Motion:
+        """Return a lane's part of the motion, in its family's own names and places."""
         prefix, shift, poses = f"{LANES[lane]} ", np.array(self.layouts[lane].shift), self._motion
         names = {name.removeprefix(prefix): name for name in poses.positions if name.startswith(prefix)}
         positions = {own: poses.positions[name] - shift for own, name in names.items()}
-        motion = Motion(poses.times, positions, {own: poses.rotations[name] for own, name in names.items()})
-        return read_outcome(self.events[lane].family, motion, self.events[lane].params)
+        return Motion(poses.times, positions, {own: poses.rotations[name] for own, name in names.items()})
+
+    def outcome(self, lane: int) -> Outcome:
+        """Return a lane's outcome, read by its family from its part of the motion."""
+        return read_outcome(self.events[lane].family, self.motion(lane), self.events[lane].params)
 
     def clip(self, hidden: Sequence[bool]) -> np.ndarray:
         """Return the poses of the clip in which some lanes are hidden, (F, nq)."""

@@ -21,7 +21,7 @@ function compared(found, left, right, dataset, decision) {
     const [a, b] = rows.map((row) => decisions[column][row]);
     if (a > YES || b > YES) continue;
     if (epochs[0] !== epochs[1])
-      refused = `epoch ${epochs[0]} against epoch ${epochs[1]}; figures of different epochs are never put in one contrast`;
+      refused = `epoch ${epochs[0]} against epoch ${epochs[1]}; metrics of different epochs are never put in one contrast`;
     sides[a ? (b ? "both" : "left") : b ? "right" : "neither"].push(item);
   }
   return { ...sides, refused };
@@ -189,7 +189,7 @@ function differenceTable(info, differences, { left, right, leftRegime, rightRegi
   });
   const columns = [
     { title: "Dataset" },
-    { title: "Figure" },
+    { title: "Metric" },
     { title: "Difference", number: true },
     { title: "95 % interval", number: true },
     { title: "p", number: true },

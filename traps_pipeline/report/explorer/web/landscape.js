@@ -34,7 +34,7 @@ async function landscapeView(route) {
         "p",
         { class: "lead" },
         "Right means telling voids from controls (J = AbsRec − FalseAbs), up means answering controls correctly. ",
-        "Curves join points of equal PECS = Acc × J. Bars are 95 % intervals; the number behind a name is its PECS.",
+        "Curves join points of equal PECS = Acc × J. Bars are 95 % intervals; the number behind a name is its PECS. Grey: reference rows, which are no models.",
       ),
       h(
         "div",
@@ -47,13 +47,13 @@ async function landscapeView(route) {
         toggle(route, "paper", "also the paper's models (hollow)"),
       ),
       shown.length
-        ? section(null, plane(shown, regime), planeTable(info, shown))
-        : section(null, notice(`${NOT_RUN}: no figure of this kind in the study`)),
+        ? section(null, plane(info, shown, regime), planeTable(info, shown))
+        : section(null, notice(`${NOT_RUN}: no metrics of this kind in the study`)),
     ],
   };
 }
 
-function plane(rows, regime) {
+function plane(info, rows, regime) {
   const { width, left, top, bottom, names, line } = PLANE;
   const height = Math.max(520, top + bottom + line * rows.length);
   const low = Math.min(0, ...rows.map((row) => row.j_ci_low ?? row.j), ...rows.map((row) => row.j));
@@ -86,7 +86,7 @@ function plane(rows, regime) {
       rows.map((row, k) =>
         s(
           "a",
-          { class: `point ${row.of_paper ? "of-paper" : ""}`, href: row.of_paper ? null : address(["model", row.model], { regime: row.regime }), "aria-label": name(row) },
+          { class: `point ${row.of_paper ? "of-paper" : isReference(info, row.model) ? "reference" : ""}`, href: row.of_paper ? null : address(["model", row.model], { regime: row.regime }), "aria-label": name(row) },
           s("title", null, `${name(row)}: PECS ${fraction(row.pecs)}, Acc ${percent(row.acc)} %, J ${fraction(row.j)}`),
           s("polyline", { class: "leader", points: `${x(row.j)},${y(row.acc)} ${width + 6},${labels[k]} ${width + 12},${labels[k]}` }),
           ends(row, "j").map(([a, b]) => s("line", { class: "interval-bar", x1: x(a), x2: x(b), y1: y(row.acc), y2: y(row.acc) })),
@@ -108,7 +108,8 @@ function ends(row, field) {
 }
 
 function planeTable(info, rows) {
-  const sorted = [...rows].sort((a, b) => (b.pecs ?? -1) - (a.pecs ?? -1) || a.model.localeCompare(b.model));
+  const best = [...rows].sort((a, b) => (b.pecs ?? -1) - (a.pecs ?? -1) || a.model.localeCompare(b.model));
+  const sorted = modelsFirst(info, best);
   const columns = [
     { title: "Model" },
     { title: "Regime" },
@@ -119,5 +120,5 @@ function planeTable(info, rows) {
     row.regime,
     ...info.figures.map((each) => figure(row, each)),
   ]);
-  return table(columns, cells, { caption: "The points", name: "landscape", data: sorted });
+  return table(columns, withHeading(info, sorted, cells), { caption: "The points", name: "landscape", data: sorted });
 }

@@ -7,7 +7,7 @@ const printerOf = ({ unit }) => (unit === "percent" ? percent : fraction);
 function figure(row, { field, unit }, mark = "") {
   const print = printerOf({ unit });
   if (!row || row[field] === null || row[field] === undefined)
-    return row ? NONE : h("span", { class: "absent" }, NOT_RUN);
+    return row ? [NONE, mark ? ` ${mark}` : null] : h("span", { class: "absent" }, NOT_RUN);
   const low = row[`${field}_ci_low`];
   const spread = row.n_runs > 1 && `${field}_std` in row ? `± ${print(row[`${field}_std`])}` : "";
   const interval = low === null || low === undefined ? "" : `[${print(low)}, ${print(row[`${field}_ci_high`])}]`;
@@ -50,7 +50,7 @@ async function leaderboardView(route) {
       twoWay: beside.get(`${model} ${of}`),
     }))
     .filter((row) => (!regime || row.regime === regime) && (!group || groupOf.get(row.model) === group));
-  shown.sort(ordering(sort, up, info.regimes));
+  shown.splice(0, shown.length, ...modelsFirst(info, shown.sort(ordering(sort, up, info.regimes))));
   const withPairs = own.length > 0 || !askedOfLanes(info).length;
   const withPaper = shown.some((row) => row.paper);
   const columns = [
@@ -72,15 +72,17 @@ async function leaderboardView(route) {
     { title: "n", number: true, sort: "n_pairs", group: true, hint: info.legend.n },
     { title: "Runs", number: true },
     { title: "Missing", number: true, sort: "n_missing", hint: info.legend.Missing },
+    ...info.counts.map(({ field, title }) => ({ title, number: true, sort: field, hint: info.legend[title] })),
   ];
-  const [missingMark, incompleteMark] = Object.keys(info.marks);
+  const [missingMark, incompleteMark, brokenMark] = Object.keys(info.marks);
+  const markOf = (row) => (row ? (row.incomplete ? incompleteMark : "") + (row.is_broken ? brokenMark : "") : "");
   const rows = shown.map((row) => [
     row.own || asked.has(`${row.model} ${row.regime}`)
       ? link(["model", row.model], { regime: row.regime, dataset: dataset === "overall" ? "" : dataset }, row.model)
       : row.model,
     h("span", { class: "tag" }, row.regime),
     ...info.figures.map((each) =>
-      figure(row.own, each, each.field === "pecs" && row.own && row.own.incomplete ? incompleteMark : ""),
+      figure(row.own, each, each.field === "pecs" ? markOf(row.own) : ""),
     ),
     rankOf(row.own),
     ...(beside.size ? info.two_way_figures.map((each) => figure(row.twoWay, each)) : []),
@@ -92,6 +94,10 @@ async function leaderboardView(route) {
     row.own ? count(row.own.n_pairs) : NONE,
     row.own ? count(row.own.n_runs) : NONE,
     row.own ? `${count(row.own.n_missing)}${row.own.n_missing ? ` ${missingMark}` : ""}` : NONE,
+    ...info.counts.map(({ field, unit }) => {
+      const value = row.own?.[field] ?? null;
+      return value === null ? NONE : unit === "percent" ? percent(value) : count(value);
+    }),
   ]);
   const change = (by, down) => route.change({ sort: by === "pecs" ? "" : by, up: down ? "" : "1" });
   const models = distinct(own.map((row) => row.model));
@@ -100,6 +106,7 @@ async function leaderboardView(route) {
   return {
     title: "Leaderboard",
     body: [
+      info.shortfall ? notice(info.shortfall, "error") : null,
       h(
         "p",
         { class: "lead" },
@@ -131,7 +138,7 @@ async function leaderboardView(route) {
       withPairs &&
         section(
           null,
-          table(columns, rows, {
+          table(columns, withHeading(info, shown, rows), {
             caption: `${info.titles[dataset] || dataset}: ${counted(shown.length, "entry", "entries")}`,
             name: "leaderboard",
             order: { by: sort, down: !up },
@@ -196,10 +203,10 @@ function ordering(sort, up, regimes) {
 }
 
 function notes(info, shown, dataset) {
-  const [missingMark, incompleteMark] = Object.keys(info.marks);
-  const used = [];
-  if (shown.some((row) => row.own?.n_missing)) used.push(`${missingMark} ${info.marks[missingMark]}`);
-  if (shown.some((row) => row.own?.incomplete)) used.push(`${incompleteMark} ${info.marks[incompleteMark]}`);
+  const marked = ["n_missing", "incomplete", "is_broken"].map((field) => shown.some((row) => row.own?.[field]));
+  const used = Object.entries(info.marks)
+    .filter((_, k) => marked[k])
+    .map((entry) => entry.join(" "));
   if (dataset === "overall" && shown.some((row) => !row.own))
     used.push(`${NOT_RUN}: this study did not ask the model, or not on all four datasets`);
   used.push(

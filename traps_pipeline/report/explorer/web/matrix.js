@@ -5,9 +5,10 @@ async function matrixView(route) {
   const regime = route.parameters.regime ?? (info.regimes[0] || "");
   const { dataset = "", run = "", outcome = "confabulated", group = "" } = route.parameters;
   const groupOf = new Map(info.models.map((model) => [model.id, model.group]));
-  const models = modelsOf(info).filter(
-    (model) => (!group || groupOf.get(model) === group) && evaluationsOf(info, { model, regime, run }).length,
-  );
+  const fits = ({ model }) => !group || groupOf.get(model) === group;
+  const models = modelsFirst(info, modelsOf(info).map((model) => ({ model })).filter(fits))
+    .map(({ model }) => model)
+    .filter((model) => evaluationsOf(info, { model, regime, run }).length);
   const which = Math.max(
     0,
     OUTCOMES.findIndex(({ id }) => id === outcome),

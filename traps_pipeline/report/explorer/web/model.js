@@ -12,7 +12,7 @@ async function modelView(route) {
   return {
     title: name,
     body: [
-      h("p", { class: "lead" }, "Each count leads to the answers behind it."),
+      h("p", { class: "lead" }, isReference(info, name) ? "A reference row, no model. " : "", "Each count leads to the answers behind it."),
       h(
         "div",
         { class: "filters" },
@@ -42,7 +42,7 @@ async function modelView(route) {
           "Family",
         ),
       ),
-      section("Figures", modelFigures(info, name, dataset, regime)),
+      section("Metrics", modelFigures(info, name, dataset, regime)),
     ],
   };
 }
@@ -70,8 +70,8 @@ function modelFigures(info, name, dataset, regime) {
     count(row.n_missing),
   ]);
   return table(columns, rows, {
-    caption: "Figures of the leaderboard",
-    absent: `${NOT_RUN}: no figures of this model here`,
+    caption: "Metrics of the leaderboard",
+    absent: `${NOT_RUN}: no metrics of this model here`,
   });
 }
 

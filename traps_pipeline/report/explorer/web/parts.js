@@ -42,6 +42,15 @@ function titleOf(info, dataset) {
   return info.datasets.find(({ id }) => id === dataset).title;
 }
 
+// Reference rows are of strategies whose score is known, not of models: they come last, below a heading.
+const isReference = (info, model) => info.models.some(({ id, group }) => id === model && group === "reference");
+const modelsFirst = (info, items) =>
+  [...items].sort((left, right) => Number(isReference(info, left.model)) - Number(isReference(info, right.model)));
+function withHeading(info, items, rows) {
+  const first = items.findIndex(({ model }) => isReference(info, model));
+  return first < 0 ? rows : [...rows.slice(0, first), ["Reference rows"], ...rows.slice(first)];
+}
+
 const same = (values) => values.map((value) => [value, value]);
 const distinct = (values) => [...new Set(values)];
 const modelsOf = (info) => distinct(info.evaluations.map(([model]) => model));
@@ -116,12 +125,16 @@ function table(columns, rows, { caption, order, sortBy, absent = NOT_RUN, name =
       : column.title;
     return h("th", { scope: "col", class: classes(column, k), "aria-sort": direction, title: column.hint }, title);
   });
-  const line = (cells) =>
-    h(
+  const line = (cells) => {
+    const colspan = cells.length < columns.length ? columns.length : null; // of a heading between rows
+    return h(
       "tr",
       null,
-      cells.map((cell, k) => h(k ? "td" : "th", { scope: k ? null : "row", class: classes(columns[k], k) }, cell)),
+      cells.map((cell, k) =>
+        h(k ? "td" : "th", { scope: k ? null : colspan ? "rowgroup" : "row", colspan, class: classes(columns[k], k) }, cell),
+      ),
     );
+  };
   const empty = h("tr", null, h("td", { colspan: columns.length, class: "absent" }, absent));
   const whole = h(
     "div",
