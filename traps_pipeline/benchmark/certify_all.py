@@ -21,7 +21,7 @@ from traps_pipeline.benchmark.composition import load_composition, problems
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import telling_numbers
 from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
-from traps_pipeline.benchmark.records import load_released, two_events_lines
+from traps_pipeline.benchmark.records import load_released, refuse_recorded, two_events_lines
 from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
@@ -57,6 +57,7 @@ def certify_all(
     lanes = [line.spec for line in lines if families is None or line.family in families]
     if not specs and not lanes:
         raise TrapsError(f"{released_folder}: holds no records of {', '.join(families or ())}")
+    refuse_recorded("traps benchmark certify", released_folder)
     cases = [_case(released_folder, cache_folder, spec) for spec in specs]
     cases += [_case(lanes_folder, cache_folder, spec) for spec in lanes]
     if fresh:

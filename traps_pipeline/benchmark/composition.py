@@ -67,10 +67,15 @@ def sample_benchmark(
         names = [family for family in lane_families() if family in counts]
         drawn = (names, two_events, seed, out / "two_events" / "released", difficulty)
         lanes = sample_two_events(*drawn, workers=workers, report=report) if two_events else 0
+    name_benchmark(out, name)
+    return sum(counts.values()) + lanes
+
+
+def name_benchmark(out: Path, name: str) -> None:
+    """Write `benchmark.yaml` with a canary of its own, unless the folder has one."""
     if not (out / "benchmark.yaml").exists():
         release = {"name": name, "version": "1.0.0", "canary": f"{name.upper()}:CANARY:{uuid.uuid4()}"}
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
-    return sum(counts.values()) + lanes
 
 
 def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:

@@ -29,7 +29,7 @@ from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines, two_events_lines
-from traps_pipeline.protocol.datasets import ALL_CATEGORIES
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names, get_family
 from traps_pipeline.scenes.worlds.spec import Answerable, SceneSpec, Slug
 from traps_pipeline.storage.study import Study
@@ -251,6 +251,10 @@ def _correct(where: str, prior: Scenario, correction: Correction) -> Scenario:
     if not changes:
         raise TrapsError(f"{where}: `correct` gives no change; give words, answer or params, or use `keep`")
     params = prior.params
+    if "params" in changes and prior.family == RECORDED:
+        raise TrapsError(
+            f"{where}: {prior.scenario_id}: recorded pairs have no parameters; change its line and import it again"
+        )
     if "params" in changes:
         base = params if params is not None else (prior.released.params if prior.released else {})
         unknown = sorted(set(changes["params"]) - set(base))

@@ -19,13 +19,7 @@ from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, la
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import (
-    GRADED,
-    TWO_EVENTS,
-    extra_datasets_of,
-    sides_of,
-    taxonomy_of_category,
-)
+from traps_pipeline.protocol.datasets import GRADED, TWO_EVENTS, arms_of_category, sides_of
 from traps_pipeline.scenes.variants import arms as shortcut_arms
 from traps_pipeline.scenes.variants import graded_cuts, variations
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
@@ -75,7 +69,7 @@ class Job:
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
     """Return a category's arms and variations that some experiment requests."""
     datasets = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
-    return [arm for arm in extra_datasets_of(taxonomy_of_category(category)) if arm in datasets]
+    return [arm for arm in arms_of_category(category) if arm in datasets]
 
 
 def arms_of_pairs(workspace: Workspace, category: str) -> list[str]:

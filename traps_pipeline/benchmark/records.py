@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import RELEASED, SCENE_SPECS, TWO_EVENTS_RELEASED
 from traps_pipeline.base.yamlfile import check_line, explain, parse_yaml_model, read_unchecked_lines, read_yaml
-from traps_pipeline.protocol.datasets import ALL_CATEGORIES
+from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # importing it takes longer than reading the lines
     from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 
 Record = TypeVar("Record", SceneSpec, "TwoEventsSpec")
+NOT_MIXED = "holds simulated records, and recorded ones are never averaged with them; give each a folder of its own"
 
 
 class Release(BaseModel):
@@ -93,7 +94,20 @@ def _lines(folder: Path, parse: Callable[[str, str], Record]) -> dict[str, Relea
                     f"{path}:{number}: scenario {record_line.scenario_id!r} occurs twice; remove one of the lines"
                 )
             records[record_line.scenario_id] = record_line
+            if (record_line.family == RECORDED) != (next(iter(records.values())).family == RECORDED):
+                raise TrapsError(f"{path}:{number}: {folder} {NOT_MIXED}")
     return records
+
+
+def is_recorded(folder: Path = RELEASED) -> bool:
+    """Return whether a benchmark's pairs are recorded: it holds one kind."""
+    return next(iter(released_lines(folder).values())).family == RECORDED
+
+
+def refuse_recorded(what: str, folder: Path = RELEASED) -> None:
+    """Raise TrapsError, once, for what needs the physics that recorded pairs do not have."""
+    if is_recorded(folder):
+        raise TrapsError(f"{what}: not for recorded pairs, which nobody simulated; leave it out (docs/recorded.md)")
 
 
 def _line(line: str, where: str, parse: Callable[[str, str], Record]) -> ReleasedLine[Record]:
@@ -127,7 +141,7 @@ def _parse(kind: type[Record], line: str, where: str) -> Record:
         raise TrapsError(f"{where}: not a valid record ({explain(error)}); restore the line from git") from error
     except ValueError as error:
         raise TrapsError(f"{where}: not JSON ({error}); restore the line from git") from error
-    if spec.family not in family_names():
+    if spec.family not in (*family_names(), RECORDED):
         known = f"known: {', '.join(family_names())}"
         advice = f"install {spec.evidence['package']}, which adds it" if "package" in spec.evidence else known
         raise TrapsError(f"{where}: {spec.scenario_id}: unknown family {spec.family!r}; {advice}")

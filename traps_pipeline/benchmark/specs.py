@@ -19,6 +19,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, PACKAGE, RELEASED, ROOT, user_cache
 from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, load_two_events, subset
+from traps_pipeline.benchmark.recorded_clips import clip_path, clip_problems
 from traps_pipeline.benchmark.records import parse_record, released_lines, two_events_lines
 from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.scenes.family_registry import get_family
@@ -45,6 +46,8 @@ def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenar
     """Return the corrected record; simulate a changed or added scene once."""
     if scenario.params is None:
         spec = scenario.changed_words()
+        if spec.is_recorded:
+            return ResolvedScenario(spec, clip_path(RELEASED, spec.scenario_id, "control"))
         return ResolvedScenario(spec, RELEASED / "trajectories" / f"{spec.scenario_id}.npz")
     spec, trajectory = _resolve_again(workspace, scenario)
     words = dict(scenario.words)
@@ -155,6 +158,10 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
     released_specs = released_in_study(workspace, category).values()
     version = version_of((spec.spec_hash for spec in released_specs), (r.spec.spec_hash for r in resolved_scenarios))
     for item in resolved_scenarios:
+        if item.spec.is_recorded:
+            if problems := clip_problems(item.spec, RELEASED):
+                raise TrapsError(problems[0])
+            continue
         try:
             get_family(item.spec.family).params_from(item.spec.params)
             load_trajectory(item.trajectory, item.spec.trajectory_sha256)
@@ -232,8 +239,8 @@ def _row(workspace: Workspace, item: ResolvedScenario, version: str) -> SceneSpe
         scene_hash=spec.scene_hash,
         spec_hash=spec.spec_hash,
         trajectory=_relative(item.trajectory, workspace.root, ROOT),
-        commit_s=float(spec.evidence["commit_s"]),
-        margin_m=float(spec.evidence["margin_m"]),
+        commit_s=float(spec.physics["duration_s"] if spec.is_recorded else spec.evidence["commit_s"]),
+        margin_m=float(0.0 if spec.is_recorded else spec.evidence["margin_m"]),
         void_from_s=void_from_s(spec),
         evidence=json.dumps(spec.evidence, sort_keys=True),
         benchmark_version=version,
@@ -275,8 +282,8 @@ def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
     problems, known, settled = [], _settled_records(), set[str]()
     for item in resolved:
         spec, key = item.spec, _replayed(item.spec)
-        if spec.evidence.get("answer_from") == "correction" or key in known:
-            continue  # the reviewer's answer overrides the simulator's
+        if spec.is_recorded or spec.evidence.get("answer_from") == "correction" or key in known:
+            continue  # nothing was simulated, or the reviewer's answer overrides the simulator's
         from traps_pipeline.scenes.certification.certificates import OUTCOME, pair_of
 
         qpos = load_trajectory(item.trajectory, spec.trajectory_sha256)

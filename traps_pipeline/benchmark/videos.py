@@ -9,8 +9,10 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.benchmark.recorded_clips import copy_clips
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
+from traps_pipeline.protocol.datasets import RECORDED
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
 from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip
@@ -36,6 +38,9 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
         return read_clip(clip) is not None or (cache is not None and cache.bring(clip, row["scene_hash"]))
 
     def job(row: Row) -> Job | None:
+        if row["family"] == RECORDED:
+            copy_clips(spec_of(row), zip(_sides(row), _clips(workspace, row), strict=True))
+            return None
         are_here = [is_here(clip, row) for clip in _clips(workspace, row)]
         return None if all(are_here) else _job(workspace, row)
 
@@ -60,7 +65,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
     clips = [
         workspace.clip(id_, side, spec.scene_hash)
         for id_, spec in released_in_study(workspace, category).items()
-        for side in CLIPS
+        for side in (CLIPS if not spec.is_recorded else ())
     ]
     return SECONDS_A_CLIP * (len(clips) - len(workspace.store.there(clips)))
 
@@ -79,9 +84,14 @@ def _tick(category: str, total: int, finished: int) -> None:
     progress.current().tick("videos", f"{category}, scenarios", finished, total)
 
 
-def _clips(workspace: Workspace, row: Row) -> tuple[Path, Path, Path]:
-    control, void, twin = (workspace.clip(row["scenario_id"], side, row["scene_hash"]) for side in CLIPS)
-    return control, void, twin
+def _sides(row: Row) -> list[str]:
+    """Return a scenario's clips: a recorded one may lack a twin."""
+    recorded = json.loads(row["params"])["clips"] if row["family"] == RECORDED else CLIPS
+    return [side for side in CLIPS if side in recorded]
+
+
+def _clips(workspace: Workspace, row: Row) -> list[Path]:
+    return [workspace.clip(row["scenario_id"], side, row["scene_hash"]) for side in _sides(row)]
 
 
 def _files(workspace: Workspace, row: Row) -> list[Path]:
@@ -90,12 +100,14 @@ def _files(workspace: Workspace, row: Row) -> list[Path]:
 
 def _job(workspace: Workspace, row: Row) -> Job:
     trajectories = trajectory_of(workspace, row), trajectory_of(workspace, row, "twin")
-    return Job(spec_of(row), *trajectories, *_clips(workspace, row))
+    control, void, twin = _clips(workspace, row)
+    return Job(spec_of(row), *trajectories, control, void, twin)
 
 
 def _rows(workspace: Workspace, spec: Row, clips: Mapping[Path, Clip], version: str) -> list[VideoRow]:
-    rows, (width, height) = [], frame_size(json.loads(spec["params"]))
-    for side, path in zip(CLIPS, _clips(workspace, spec), strict=True):
+    params = json.loads(spec["params"])
+    rows, (width, height) = [], params["size"] if spec["family"] == RECORDED else frame_size(params)
+    for side, path in zip(_sides(spec), _clips(workspace, spec), strict=True):
         clip = clips.get(path)
         if clip is None:
             raise TrapsError(f"{path}: was not rendered; run again")

@@ -1,9 +1,11 @@
-"""Certify, sample, commit to and prove benchmarks (`traps benchmark`)."""
+"""Certify, sample, import, commit to and prove benchmarks (`traps benchmark`)."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,6 +77,13 @@ def add(commands: Commands) -> None:
     parser.add_argument("--longer", action="store_true", help="longer rows, more lanes, greater counts")
     parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
 
+    text = "make a benchmark of your own videos: a table of pairs and their clips in, records out"
+    parser = commands.add("benchmark import", import_pairs, text, example="videos --out garden", workspace=False)
+    parser.add_argument("folder", type=Path, help="folder with pairs.csv or pairs.jsonl (docs/recorded.md)")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the benchmark; what it has is kept")
+    parser.add_argument("--name", help="its name (default: that of the folder --out)")
+    parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
+
     text = "fix a sampled benchmark before anybody sees it: write a commitment to publish, and a reveal to keep"
     example = "private --out public.json --reveal secret.json"
     parser = commands.add("benchmark commit", commit_benchmark, text, example=example, workspace=False)
@@ -117,8 +126,16 @@ def certify(arguments: argparse.Namespace) -> int:
     return FAILED if problems else OK
 
 
-def sample(arguments: argparse.Namespace) -> int:
+def _name(text: str) -> str:
     from traps_pipeline.base.names import check_name
+
+    try:
+        return check_name(text)
+    except ValueError as error:
+        raise TrapsError(f"--name: {error}") from None
+
+
+def sample(arguments: argparse.Namespace) -> int:
     from traps_pipeline.benchmark.composition import load_composition, sample_benchmark
     from traps_pipeline.benchmark.records import load_release
     from traps_pipeline.scenes.family_registry import family_names
@@ -135,16 +152,11 @@ def sample(arguments: argparse.Namespace) -> int:
             f"composition.yaml has no number of scenarios for {', '.join(names_without_count)}; say --count N"
         )
     targets = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
-    name = arguments.name or f"private-{arguments.seed}"
-    try:
-        check_name(name)
-    except ValueError as error:
-        raise TrapsError(f"--name: {error}") from None
     n_scenarios = sample_benchmark(
         arguments.out.absolute(),
         targets,
         arguments.seed,
-        name,
+        _name(arguments.name or f"private-{arguments.seed}"),
         look=arguments.look,
         difficulty=Difficulty(arguments.distractors, arguments.speed, arguments.longer),
         two_events=arguments.two_events,
@@ -159,6 +171,30 @@ def sample(arguments: argparse.Namespace) -> int:
         f"TRAPS_SCENE_SPECS={arguments.out} and `benchmark: {benchmark}` in the experiment"
     )
     return OK
+
+
+def import_pairs(arguments: argparse.Namespace) -> int:
+    from traps_pipeline.benchmark.import_recorded import import_recorded
+    from traps_pipeline.benchmark.leaks import measure_leaks
+    from traps_pipeline.benchmark.records import load_release
+    from traps_pipeline.people.recorded_certificates import NOT_CERTIFIED
+    from traps_pipeline.protocol.datasets import datasets_of_category
+    from traps_pipeline.scoring.power import scale_for
+
+    out = arguments.out.absolute()
+    name = _name(arguments.name or out.name)
+    say = partial(print, flush=True)
+    records, problems = import_recorded(arguments.folder, out, name, workers=arguments.workers, report=say)
+    print(measure_leaks(records, out))
+    pairs = Counter(dataset for record in records for dataset in datasets_of_category(record.category))
+    needed = ", ".join(f"{name} {scale_for(pairs, 0.1) * n:,.0f}" for name, n in sorted(pairs.items()))
+    print(f"pairs for an interval of PECS of .1, with a model in the middle: about {needed}")
+    for problem in problems:
+        print(f"traps: {problem}", file=sys.stderr)
+    print(f"{count_noun(len(records), 'pair')} in {arguments.out}, {len(problems)} not imported; {NOT_CERTIFIED}")
+    release = load_release(out / "benchmark.yaml").name
+    print(f"next: TRAPS_SCENE_SPECS={arguments.out}, `benchmark: {release}` in the experiment, and traps run")
+    return FAILED if problems else OK
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:

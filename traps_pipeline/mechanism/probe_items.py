@@ -33,6 +33,8 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
         clips = workspace.tables.read(VIDEOS, {"category": category})
         voids = clips.loc[clips["side"] == "void"].set_index("scenario_id")
         for spec in workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records"):
+            if spec["answerable_question"] == "null":  # recorded
+                continue
             if spec["scenario_id"] not in voids.index:
                 raise TrapsError(f"{spec['scenario_id']}: has no void clip yet; materialize videos for {category}")
             rows.append(_answerable_item(spec, voids.loc[spec["scenario_id"]].to_dict()))

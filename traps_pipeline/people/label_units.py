@@ -19,13 +19,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
+from traps_pipeline.benchmark.records import is_recorded
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.people.human_label_rows import PROTOCOL_FILE
 from traps_pipeline.people.judge_validation import sheet_rows
-from traps_pipeline.protocol.datasets import DATASETS
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.workspace import Workspace
 
@@ -58,6 +59,7 @@ class AnnotationProtocol(BaseModel):
     split_share: float = Field(ge=0, le=1)
     split_from: float = Field(gt=0, le=1)
     sitting_hours: float = Field(gt=0)
+    certified_by: int = Field(ge=1)
 
 
 @cache
@@ -144,7 +146,11 @@ def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
         return population.loc[population["unit"].isin(sorted(sample_ids))].reset_index(drop=True)
     protocol = annotation_protocol()
     size = getattr(protocol.sizes, task)
-    unit_groups = [drawn_units(group, size, protocol) for _, group in population.groupby("group", sort=True)]
+    certifies = task == "answerability" and is_recorded()
+    unit_groups = [
+        drawn_units(group, len(group) if certifies and not is_ill_posed(str(name).split()[0]) else size, protocol)
+        for name, group in population.groupby("group", sort=True)
+    ]
     return pd.concat(unit_groups, ignore_index=True)
 
 

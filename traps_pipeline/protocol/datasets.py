@@ -17,7 +17,10 @@ CATEGORIES = OCCLUSION_CATEGORIES + CHAOTIC_CATEGORIES
 # Domains beside the benchmark's: each has its own benchmark (`scene_specs/extensions/`), whose voids use an
 # occluder, as those of occlusion do. No study of the main benchmark and no number of the paper includes one.
 EXTENSION_CATEGORIES = ("soft_bodies",)
-ALL_CATEGORIES = CATEGORIES + EXTENSION_CATEGORIES
+# Pairs of recorded video, in benchmarks of their own: voids that are covered or filmed apart, and voids that are cut.
+RECORDED = "recorded"  # the family of all that nobody simulated
+RECORDED_CATEGORIES = ("recorded_hidden", "recorded_cut")
+ALL_CATEGORIES = CATEGORIES + EXTENSION_CATEGORIES + RECORDED_CATEGORIES
 
 DATASETS = ("occlusion", "occlusion_ill_posed", "chaotic", "chaotic_ill_posed")
 SHORT = {"occlusion": "oc", "occlusion_ill_posed": "oc_ip", "chaotic": "ch", "chaotic_ill_posed": "ch_ip"}
@@ -73,7 +76,7 @@ def transfer_type(source: str, target: str) -> str:
 
 def taxonomy_of_category(category: str) -> str:
     """Return `occlusion` or `chaotic`."""
-    return "chaotic" if category in CHAOTIC_CATEGORIES else "occlusion"
+    return "chaotic" if category in (*CHAOTIC_CATEGORIES, "recorded_cut") else "occlusion"
 
 
 def datasets_of_category(category: str) -> tuple[str, str]:
@@ -87,9 +90,14 @@ def extra_datasets_of(taxonomy: str) -> tuple[str, ...]:
     return tuple(name for name in UNPAIRED if _ONE_TAXONOMY.get(name, taxonomy) == taxonomy)
 
 
+def arms_of_category(category: str) -> tuple[str, ...]:
+    """Return the arms and variations of a category's scenarios; none of recorded ones, which have no physics."""
+    return () if category in RECORDED_CATEGORIES else extra_datasets_of(taxonomy_of_category(category))
+
+
 def all_datasets_of(category: str) -> tuple[str, ...]:
     """Return all datasets, with arms and variations, of a category's scenarios."""
-    return (*datasets_of_category(category), *extra_datasets_of(taxonomy_of_category(category)))
+    return (*datasets_of_category(category), *arms_of_category(category))
 
 
 def dataset_of(item_id: str) -> str:

@@ -27,21 +27,21 @@ def environment() -> Environment:
 
 def card(manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapping[str, str]) -> str:
     """Return the README of a released folder."""
+    recorded = manifest.get("recorded", False)
     header = {
         "pretty_name": f"{manifest['name']} {manifest['version']}",
         "language": ["en"],
-        "license": ["cc-by-4.0", "cc-by-nc-4.0"],
+        "license": ["other" if recorded else "cc-by-4.0", "cc-by-nc-4.0"],
         "task_categories": ["video-text-to-text", "visual-question-answering"],
-        "tags": ["abstention", "benchmark", "video", "croissant", "mujoco"],
+        "tags": ["abstention", "benchmark", "video", "croissant", *([] if recorded else ["mujoco"])],
         "size_categories": [_size(max(manifest["rows"].values()))],
-        "annotations_creators": ["machine-generated"],
+        "annotations_creators": ["expert-generated" if recorded else "machine-generated"],
         "source_datasets": ["original"],
         "configs": [_config(table, places) for table in tables if table.name in _WITH_CLIPS],
     }
     front_matter = yaml.safe_dump(header, sort_keys=False, allow_unicode=True)
-    return (
-        environment().get_template("card.md.j2").render(header=front_matter, tables=tables, places=places, **manifest)
-    )
+    fields = {"header": front_matter, "tables": tables, "places": places, **manifest, "recorded": recorded}
+    return environment().get_template("card.md.j2").render(fields)
 
 
 def _config(table: Table[Any], places: Mapping[str, str]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.workers import keep_workers
 from traps_pipeline.base.yamlfile import explain, read_lines
 from traps_pipeline.benchmark.held_out import require_secret_seed
-from traps_pipeline.benchmark.records import load_release, load_released, parse_record
+from traps_pipeline.benchmark.records import load_release, load_released, parse_record, refuse_recorded
 from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
 from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
@@ -84,6 +84,7 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
     for path in (commitment, reveal):
         if path.exists():
             raise TrapsError(f"{path}: is there already, and a commitment is made once; name another file")
+    refuse_recorded("traps benchmark commit", benchmark / "released")
     specs, tallies = load_released(benchmark / "released"), load_tallies(benchmark / "released")
     draws_of = {(tally.seed, tally.difficulty) for tally in tallies.values()}
     if len(draws_of) != 1 or {spec.family for spec in specs.values()} != {*tallies}:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.registry.prompts import prompt, system_prompt
+from traps_pipeline.people.recorded_certificates import recorded_verdicts
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.regimes import REGIMES
@@ -43,13 +44,17 @@ CLIPS = "clips"
 PROMPT_LICENCE = "CC-BY-NC-4.0"
 SYSTEM, JUDGE = "system prompt of a model", "prompt of a judge"
 _CLIPS = f"{CLIPS}/"
+_SIMULATED = {"source": "simulated", "licence": "CC-BY-4.0"}  # of clips that nobody recorded
 
 Rows = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class Content:
-    """A release's content: the study's folder, ITEMS and SCENE_SPECS rows, clips by path, benchmark, two events."""
+    """A release's content: the study's folder, ITEMS and SCENE_SPECS rows, clips by path, benchmark, two events.
+
+    people: by recorded scenario why people do not certify it, None where they do.
+    """
 
     study: Path
     items: Rows
@@ -57,6 +62,7 @@ class Content:
     clips: Mapping[str, Path]
     release: Release
     two_events: Sequence[TwoEventsSpec] = ()
+    people: Mapping[str, str | None] = field(default_factory=dict)
 
     @property
     def versions(self) -> dict[str, str]:
@@ -83,7 +89,8 @@ def content_of(workspace: Workspace, arms: Sequence[str] = ()) -> Content:
             raise TrapsError(f"{path}: is missing or not the clip of its item; materialize videos again")
     lanes = load_two_events(workspace.study)
     two_events = [lanes[id_].spec for id_ in sorted(_ids(row for row in items if row["dataset"] == TWO_EVENTS))]
-    return Content(workspace.root, items, specs, clips, load_release(), two_events)
+    people = recorded_verdicts(workspace.tables)
+    return Content(workspace.root, items, specs, clips, load_release(), two_events, people)
 
 
 def _records(workspace: Workspace, table: Any, datasets: Sequence[str] | None = None) -> list[dict[str, Any]]:
@@ -109,6 +116,7 @@ def pair_rows(content: Content) -> list[PairRow]:
     for row in content.items:
         if row["dataset"] in DATASETS:
             pairs.setdefault(row["pair_id"], {})[row["side"]] = row
+    evidence = {row["scenario_id"]: json.loads(row["evidence"]) for row in content.specs}
     for pair_id, sides in sorted(pairs.items()):
         if len(sides) < 2:
             raise TrapsError(f"{pair_id}: only its {next(iter(sides))} is there; make items again")
@@ -134,6 +142,7 @@ def pair_rows(content: Content) -> list[PairRow]:
                 control_question=control["question"],
                 void_question=void["question"],
                 lite=control["scenario_id"] in lite_scenarios,
+                **{name: evidence[control["scenario_id"]].get(name, own) for name, own in _SIMULATED.items()},
                 canary=content.release.canary,
             )
         )
@@ -184,12 +193,26 @@ def two_events_rows(content: Content) -> list[TwoEventsRow]:
 
 def certificate_rows(content: Content) -> list[CertificateRow]:
     """Return one row per certificate and scenario, evaluated on the record's numbers."""
-    return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content.release.canary)]
+    return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content)]
 
 
-def _certificates(spec: SceneSpec, canary: str) -> Iterable[CertificateRow]:
+def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]:
     import numpy as np
 
+    canary = content.release.canary
+    if spec.is_recorded:
+        failure = content.people[spec.scenario_id]
+        yield CertificateRow(
+            scenario_id=spec.scenario_id,
+            certificate="people",
+            about="void",
+            promises="People who saw one clip at a time answered the control rightly and could not know the void.",
+            holds=failure is None,
+            failure=failure,
+            evidence=json.dumps(spec.evidence, sort_keys=True, ensure_ascii=False),
+            canary=canary,
+        )
+        return
     record_evidence, claim = stored_evidence(spec), Claim.of_record(spec)
     empty_trajectory = np.empty((0, 0), np.float32)  # words are certified without a trajectory
     for certificate in certificates_for(spec.void_kind):

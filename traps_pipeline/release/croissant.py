@@ -67,6 +67,13 @@ _RAI: Mapping[str, Any] = {
     "part that they change.",
 }
 
+_RECORDED_RAI: Mapping[str, Any] = {
+    "rai:dataCollection": "Video that the publisher brought; columns `source` and `licence` of `pairs`.",
+    "rai:dataAnnotationProtocol": "The publisher states the answers; people certify pairs (table `certificates`).",
+    "rai:dataLimitations": ["No simulator proves a void; pairs that people do not certify are not certified."],
+    "rai:personalSensitiveInformation": ["Clips may show people; ask the publisher."],
+}
+
 
 def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[Any]], places: Mapping[str, str]) -> str:
     """Return the JSON-LD description of a folder that already holds the tables."""
@@ -77,7 +84,10 @@ def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[An
         "description": "Matched pairs of clips and questions: a control whose outcome can be seen, and a void in which "
         f"one change makes it impossible to determine. Canary: {manifest['canary']}",
         "conformsTo": CONFORMS_TO,
-        "license": ["https://creativecommons.org/licenses/by/4.0/", "https://creativecommons.org/licenses/by-nc/4.0/"],
+        "license": [
+            "LICENSE-DATA" if manifest.get("recorded") else "https://creativecommons.org/licenses/by/4.0/",
+            "https://creativecommons.org/licenses/by-nc/4.0/",
+        ],
         "version": manifest["version"],
         "citeAs": "See CITATION.cff.",
         "creator": {"@type": "sc:Organization", "name": _creator(manifest)},
@@ -85,7 +95,7 @@ def croissant(root: Path, manifest: Mapping[str, Any], tables: Sequence[Table[An
         "keywords": ["abstention", "benchmark", "video question answering", "vision-language models"],
         "isLiveDataset": False,
         **({"datePublished": manifest["date"]} if manifest["date"] else {}),
-        **_RAI,
+        **(_RECORDED_RAI if manifest.get("recorded") else _RAI),
         "distribution": [*_files(root, tables, places), _clips()],
         "recordSet": [_record_set(table, places[table.name]) for table in tables],
     }

@@ -46,6 +46,9 @@ FORMAT = 1  # version of the released folder's format
 MANIFEST, COMMITMENT, CROISSANT = "release.json", "commitment.json", "croissant.json"
 CARD, DICTIONARY, CITATION = "README.md", "DICTIONARY.md", "CITATION.cff"
 LICENCE, PROMPTS_LICENCE = "LICENSE-DATA", "LICENSE-PROMPTS"
+RECORDED_LICENCE = (
+    "Clips and words of each pair: as its importer states in the columns source, licence of metadata.jsonl."
+)
 # The hub's loader finds clips only below their table's folder: pairs name them from the top, items from clips/.
 PLACES: Mapping[str, str] = {
     PAIRS.name: "metadata.jsonl",
@@ -171,7 +174,8 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
     tables = [table for table in (OPEN if options.held_out is None else HELD_OUT) if table.name in folder.rows]
     licence = (ROOT / LICENCE).read_text(encoding="utf-8")
     prompts = (ASSETS / "prompts" / "README.md").read_text(encoding="utf-8")
-    folder.text(LICENCE, f"{licence.rstrip()}\n\n{canary}\n")
+    licence = RECORDED_LICENCE if content.people else licence.rstrip()
+    folder.text(LICENCE, f"{licence}\n\n{canary}\n")
     folder.text(PROMPTS_LICENCE, f"{prompts.rstrip()}\n\n{canary}\n")
     citation = yaml.safe_dump(ANONYMOUS_CITATION) if options.anonymous else (ROOT / CITATION).read_text("utf-8")
     folder.text(CITATION, f"# {canary}\n{citation}")
@@ -195,7 +199,8 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
 
 def _description(content: Content) -> dict[str, Any]:
     """Return name, version and canary of the release, and the version of each dataset."""
-    return {**content.release.model_dump(), "versions": content.versions}
+    recorded = {"recorded": True} if content.people else {}
+    return {**content.release.model_dump(), "versions": content.versions, **recorded}
 
 
 # --- double-blind review ----------------------------------------------------------------------------------------------

@@ -33,6 +33,8 @@ class PairRow:
     answer_type: AnswerType
     ground_truth: Annotated[str, "the right answer to the control; the right answer to the void is to abstain"]
     lite: Lite
+    source: Annotated[str, "where the clips are from: simulated, or what the importer of a recorded pair states"]
+    licence: Annotated[str, "of the clips; SPDX id, or what the importer of a recorded pair states"]
     benchmark_version: shared.BenchmarkVersion
     canary: Canary
 

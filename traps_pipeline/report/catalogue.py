@@ -79,7 +79,7 @@ class TableReport:
 
         if not results.is_study and not self.recomputed:
             return []
-        remarks = [results.judged_by] if _is_judged(self.reads) else []
+        remarks = [results.certified, *([results.judged_by] if _is_judged(self.reads) else [])]
         with_columns = ((t, printed_columns(results, t.rows, t.columns)) for t in self.make(results))
         tables = [replace(table, columns=columns, notes=[*remarks, *table.notes]) for table, columns in with_columns]
         return [table for table in tables if results.is_study or table.name in self.recomputed]
@@ -212,6 +212,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("steering_controls", "control_reports.steering_nulls", ("steering_nulls", "steering_pecs"),
         title="Steering among its controls"),
     TableReport("composition", "setup_tables.composition", ("items",), paper=True),
+    TableReport("leaks", "setup_tables.leaks", ("items",), title="What gives recorded voids away"),
     TableReport("models", "setup_tables.models", ("leaderboard",), paper=True),
     TableReport("hyperparameters", "setup_tables.hyperparameters", ("leaderboard", "judge_bias"),
         paper=True),

@@ -45,6 +45,7 @@ def _asked_earlier(workspace: Workspace) -> str:
 def board_tables(workspace: Workspace) -> list[TextTable]:
     """Return the leaderboard from the tables, one per panel, and two events by themselves; none without either."""
     from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
+    from traps_pipeline.people.recorded_certificates import certification_note
     from traps_pipeline.report.leaderboard_page import leaderboard_tables
     from traps_pipeline.report.tables.human_tables import people_notes
     from traps_pipeline.report.tables.two_way_table import two_way_table
@@ -54,5 +55,6 @@ def board_tables(workspace: Workspace) -> list[TextTable]:
     board, events = (workspace.tables.read_all(table) for table in (LEADERBOARD, TWO_WAY))
     if board.empty:
         return [table_text(two_way_table(events))] if len(events) else []
-    notes = people_notes(workspace.tables.read_all(HUMAN_ROW), workspace.tables.read_all(PANEL_ERRORS))
+    tables = workspace.tables
+    notes = people_notes(tables.read_all(HUMAN_ROW), tables.read_all(PANEL_ERRORS), certification_note(tables))
     return leaderboard_tables(board, events, notes)

@@ -104,7 +104,7 @@ def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
 ) -> dict[str, bytes]:
     """Return report page and leaderboard (Markdown, JSON lines) by path, from cards."""
-    remarks = people_notes(study.human_row, study.panel_errors)
+    remarks = people_notes(study.human_row, study.panel_errors, study.certified)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
     figures, pictures, tables = (
         [replace(card, paper=paper.get(card.name, "")) for chapter, card in cards if chapter == name]

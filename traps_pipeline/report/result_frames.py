@@ -86,6 +86,7 @@ class Results:
     source = ""  # in words, for titles
     is_study = False
     judged_by = ""  # who judged, in words, for the notes of a study's tables and figures
+    certified = ""  # how many recorded pairs people certify, for the notes of its tables
     mechanism: MechanismSettings | None = None  # of a study that looks inside models
 
     board = table_frame(LEADERBOARD)

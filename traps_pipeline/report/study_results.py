@@ -12,6 +12,7 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.mechanism_rows import COSINES, STEERING_EFFECTS
 from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.models.registry.judges import panel_id
+from traps_pipeline.people.recorded_certificates import certification_note
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.report.leaderboard_page import judged_by
 from traps_pipeline.report.result_frames import CELL_COLUMNS, RATE_COLUMNS, SUB_COLUMNS, Results, concat_frames
@@ -161,6 +162,11 @@ class StudyResults(Results):
         panels = sorted({*judged_rows["panel"]}, key=lambda name: ("+" in name, name))
         own_panel = panel_id(self._panel)
         return own_panel if own_panel in panels or not panels else panels[0]
+
+    @cached_property
+    @override
+    def certified(self) -> str:
+        return certification_note(self.tables)
 
     @cached_property
     @override

@@ -191,6 +191,7 @@ class Review:
         decisions = decisions_on(scenario_id)
         place = scenarios.index(scenario_id) if scenario_id in scenarios else -1
         neighbour = self.comparison.found.get(scenario_id)
+        void = "another" if json.loads(spec["evidence"]).get("twin_px") else "same"
         items = {side: f"{spec['taxonomy']}:{scenario_id}:{side}" for side in ("control", "void")}
         fields = {
             "scenario_id": scenario_id,
@@ -207,7 +208,7 @@ class Review:
             "captions": {
                 "control": f"Control: {answer_of_control(spec)}",
                 "void": f"Void: {intervention(spec)}",
-                "twin": f"Twin, same void: {json.loads(spec['twin'])['ground_truth']}",
+                "twin": f"Twin, {void} void: {json.loads(spec['twin'])['ground_truth']}",
             },
         }
         return page(

@@ -27,7 +27,7 @@ class SceneSpecRow:
     taxonomy: Taxonomy
     category: shared.Category
     sub_scenario: Annotated[str, "the paper's name where it has one, else the family's"]
-    family: Annotated[str, "module under scenes/families"]
+    family: Annotated[str, "module under scenes/families; recorded: nothing was simulated"]
     seed: Annotated[int, "number of the draw"]
     params: Annotated[str, "JSON: the family's parameters (SI units in the names)"]
     physics: Annotated[str, "JSON: solver settings, duration (s), frames a second"]
@@ -43,14 +43,14 @@ class SceneSpecRow:
     answer_type: AnswerType
     ground_truth: Annotated[str, "the label that the simulator's state gives"]
     ill_posed_question: Annotated[str, "question that the control clip cannot answer"]
-    answerable_question: Annotated[str, "JSON: question, labels, answer that even the void shows"]
+    answerable_question: Annotated[str, "JSON: question, labels, answer that even the void shows; null if recorded"]
     scene_hash: Annotated[str, "digest of what the clips show"]
     spec_hash: Annotated[str, "digest of the whole record"]
-    trajectory: Annotated[str, "path of the frozen qpos, relative to the checkout or the workspace if it lies there"]
+    trajectory: Annotated[str, "path of the frozen qpos (or recorded clip), relative to the checkout or workspace"]
     trajectory_sha256: Annotated[str, "digest of its values"]
     twin: Annotated[str, "JSON: another world behind the same void: its parameters, answer, digest of its trajectory"]
-    commit_s: Annotated[float, "time (s) from which the outcome holds"]
-    margin_m: Annotated[float, "distance (m) of the end state from another outcome"]
+    commit_s: Annotated[float, "time (s) from which the outcome holds; the clip's end if recorded: nobody measured it"]
+    margin_m: Annotated[float, "distance (m) of the end state from another outcome; 0 if recorded"]
     void_from_s: Annotated[float, "time (s) from which the void shows nothing decisive: hiding or cut"]
     evidence: Annotated[str, "JSON: all of the draw's evidence"]
     benchmark_version: shared.BenchmarkVersion

@@ -17,7 +17,7 @@ from traps_pipeline.benchmark.specs import (
 from traps_pipeline.pipeline.graph import Check, ConcurrentBuild, RunResources
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET, to_keys
 from traps_pipeline.pipeline.stage import is_declared, of, source, stage
-from traps_pipeline.protocol.datasets import all_datasets_of, extra_datasets_of, sides_of, taxonomy_of_category
+from traps_pipeline.protocol.datasets import all_datasets_of, arms_of_category, sides_of
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
@@ -28,7 +28,7 @@ RENDERS = RunResources(
 _stage = partial(stage, group="benchmark")
 _source = partial(source, group="benchmark", kinds=["json"], scheme=CATEGORY)
 category_to_datasets = to_keys(CATEGORY, DATASET, all_datasets_of)
-category_to_arms = to_keys(CATEGORY, DATASET, lambda category: extra_datasets_of(taxonomy_of_category(category)))
+category_to_arms = to_keys(CATEGORY, DATASET, arms_of_category)
 
 
 @_source()
@@ -44,12 +44,12 @@ def corrections(workspace: Workspace, category: str) -> str:
 
 
 def _specs_check(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
-    """Return a check by what `find` (module.function of `benchmark`) finds wrong in the records of a table."""
+    """Return a check by what `find` (module.function of `benchmark`) finds wrong in a table's simulated records."""
     module, _, name = find.partition(".")
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> Any:
         function = getattr(import_module(f"traps_pipeline.benchmark.{module}"), name)
-        return function([item.spec for item in output.beside])
+        return function([item.spec for item in output.beside if not item.spec.is_recorded])
 
     return wrong
 
@@ -189,7 +189,7 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=ConcurrentBuild(_film, _seconds_of_filming),
-    wants=lambda study, key: bool({*study.arms} & {*extra_datasets_of(taxonomy_of_category(str(key)))}),
+    wants=lambda study, key: bool({*study.arms} & {*arms_of_category(str(key))}),
     lost=_lost_arms,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:

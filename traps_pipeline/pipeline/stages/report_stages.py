@@ -51,7 +51,7 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
         Piece(
             f"{p.chapter}/{p.name}",
             lambda p=p: p.make().data,
-            (*p.reads, "published"),
+            (*p.reads, "published", *(("human_row",) if sources.study.certified else ())),
             p.inputs,
             is_shared=p.chapter == PAPER,
         )

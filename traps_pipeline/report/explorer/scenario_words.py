@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from traps_pipeline.base.wording import in_percent
+from traps_pipeline.protocol.datasets import RECORDED
 
 
 def closes_frame(spec: Mapping[str, Any]) -> int | None:
@@ -24,6 +25,8 @@ def answer_of_control(spec: Mapping[str, Any]) -> str:
 def intervention(spec: Mapping[str, Any]) -> str:
     """Return how the control's clip was changed to make the void."""
     moment = f"{spec['void_from_s']:.1f} s"
+    if spec["family"] == RECORDED and not json.loads(spec["void"]).get("cover") and spec["void_kind"] == "occluder":
+        return "another clip"
     return f"hidden from {moment}" if spec["void_kind"] == "occluder" else f"cut at {moment}"
 
 

@@ -28,6 +28,7 @@ from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.models.request import JUDGED
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
+from traps_pipeline.people.recorded_certificates import certification_note, recorded_verdicts
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, UNPAIRED, sides_of
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
@@ -240,7 +241,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "two_way_table": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in printed.columns],
         "two_way_notes": [*printed.notes],
         "people": records(human_row),
-        "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS)),
+        "said": people_notes(human_row, workspace.tables.read_all(PANEL_ERRORS), certification_note(workspace.tables)),
         "published": records(published.loc[:, ["model", "regime", "dataset", "epoch", *printed_by_paper]]),
         "legend": legend(board, two_way) if len(board) else {},
         "marks": MARKS,
@@ -252,7 +253,7 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
     """Return the data about scenarios on the pages of pairs, by scenario."""
     specs, videos = workspace.tables.read_all(SCENE_SPECS), workspace.tables.read_all(VIDEOS)
     clips = {(row["scenario_id"], row["side"]): row for row in records(videos)}
-    rows = []
+    rows, people = [], recorded_verdicts(workspace.tables)
     for spec in sorted(specs.to_dict("records"), key=lambda row: row["scenario_id"]):
         twin, evidence = json.loads(spec["twin"]), json.loads(spec["evidence"])
         control_clip, twin_clip = (clips.get((spec["scenario_id"], side)) for side in ("control", "twin"))
@@ -261,9 +262,10 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
                 "scenario_id": spec["scenario_id"],
                 "intervention": intervention(spec),
                 "labels": [*spec["labels"]],
-                "certificate": [words for _, words in certificate_phrases(evidence)],
-                "twin_answer": twin["ground_truth"],
-                "twin_clip": twin_clip["path"] if twin_clip else None,
+                "certificate": [words for _, words in certificate_phrases(evidence)]
+                + ([people[spec["scenario_id"]] or "certified by people"] if spec["scenario_id"] in people else []),
+                "twin_answer": None if evidence.get("twin_px") else twin["ground_truth"] or None,
+                "twin_clip": twin_clip["path"] if twin_clip and not evidence.get("twin_px") else None,
                 "fps": control_clip["fps"] if control_clip else None,
                 "shown_at": _seconds(closes_frame(spec), control_clip),
             }

@@ -85,9 +85,10 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     ]  # fmt: skip
 
 
-def people_notes(human_row: pd.DataFrame, panel_errors: pd.DataFrame) -> list[str]:
-    """Return leaderboard notes: people's scores, and whether the panel was validated."""
-    return [f"people: {_score_of_people(human_row)}", f"the panel: {_validation_note(panel_errors)}"]
+def people_notes(human_row: pd.DataFrame, panel_errors: pd.DataFrame, certified: str = "") -> list[str]:
+    """Return leaderboard notes: recorded pairs' certificates, people's scores, whether the panel was validated."""
+    notes = [certified] if certified else []
+    return [*notes, f"people: {_score_of_people(human_row)}", f"the panel: {_validation_note(panel_errors)}"]
 
 
 def _score_of_people(rows: pd.DataFrame) -> str:

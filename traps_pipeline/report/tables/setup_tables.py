@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from traps_pipeline.base.paths import SCENE_SPECS
 from traps_pipeline.base.wording import count_noun
+from traps_pipeline.benchmark.leaks import FILE
 from traps_pipeline.models.registry.entries import Entry, ModelEntry, load_models
 from traps_pipeline.models.registry.judges import load_judges
 from traps_pipeline.report.result_frames import Results
@@ -41,6 +44,20 @@ def _media_words(media: MediaSpec | None) -> str:
         else f"{media.fps:g} fps, at most {media.most}"
     )
     return f"{media.profile}, {frames}" + (f", {media.size[0]} x {media.size[1]}" if media.size else "")
+
+
+def leaks(results: Results) -> list[PrintedTable]:
+    """Return how well one cue alone tells recorded voids from controls, as their import measured it."""
+    path = SCENE_SPECS / FILE
+    rows = json.loads(path.read_text(encoding="utf-8")) if results.is_study and path.is_file() else []
+    columns = [
+        Column("dataset", "Dataset"), Column("cue", "Cue alone"), Column("j", "J", "fraction"),
+        Column("half_width", "±", "fraction"), Column("n_pairs", "n", "count"),
+    ]  # fmt: skip
+    notes = ["J of a classifier of the cue alone, on scenarios that it was not fitted on; 0: it tells nothing"]
+    why = "the benchmark has no recorded pairs"
+    shown = frame(rows, ["dataset", "cue", "j", "half_width", "n_pairs"])
+    return [PrintedTable("leaks", "What gives recorded voids away", shown, columns, notes if rows else [], why)]
 
 
 def hyperparameters(results: Results) -> list[PrintedTable]:

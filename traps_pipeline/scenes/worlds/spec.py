@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import replace_file
+from traps_pipeline.protocol.datasets import RECORDED
 
 if TYPE_CHECKING:
     from traps_pipeline.scenes.physics.kit import Physics
@@ -30,12 +31,17 @@ Length = Annotated[float, Field(ge=-100, le=100)]  # metres; a scene is a few me
 Angle = Annotated[float, Field(ge=-720, le=720)]  # degrees
 
 
-class _Physics(_Strict):
+class _Footage(_Strict):
+    """What a record says of its clips' length."""
+
+    duration_s: float = Field(ge=1, le=60)
+    fps: int = Field(ge=1, le=60)
+
+
+class _Physics(_Footage):
     """`kit.Physics` in a record."""
 
     timestep_s: float = Field(ge=1e-5, le=0.02)
-    duration_s: float = Field(ge=1, le=60)
-    fps: int = Field(ge=1, le=60)
     gravity_m_s2: float = Field(ge=0, le=30)
     iterations: int = Field(ge=1, le=10_000)
     tolerance: float = Field(ge=0, le=1e-2)
@@ -84,6 +90,20 @@ class _ClosingOccluder(_Closing):
     panel: _Box
 
 
+class _Recording(_Strict):
+    """What stands in the parameters' place where nothing was simulated: picture size, digest of each side's clip."""
+
+    size: list[int] = Field(min_length=2, max_length=2)
+    clips: dict[Literal["control", "void", "twin"], str]
+
+
+class _RecordedVoid(_Strict):
+    """How a recorded void hides its outcome: under a board (cover), or as another clip."""
+
+    hidden_from_frame: int = Field(ge=0)
+    cover: list[int] | None = Field(default=None, min_length=4, max_length=4, description="x, y, width, height")
+
+
 class Answerable(BaseModel):
     """A question that both videos of the pair answer."""
 
@@ -97,9 +117,9 @@ class Twin(BaseModel):
     """Another world behind the same void: what differs, outcome, trajectory's digest.
 
     params: the whole scene with another hidden element (occlusion), or none: the same scene from another start
-    (chaotic). rollout: which of the perturbed starts that follow from the record's seed and from the first row of its
-    trajectory (`ensemble.Futures`); the first row of the twin's own trajectory is that start rounded to float32, which
-    has another future.
+    (chaotic). Of recorded video it is a clip of another outcome, or empty. rollout: which of the perturbed starts
+    that follow from the record's seed and from the first row of its trajectory (`ensemble.Futures`); the first row of
+    the twin's own trajectory is that start rounded to float32, which has another future.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -138,7 +158,7 @@ class SceneSpec(BaseModel):
     answer_type: str
     ground_truth: str
     ill_posed_question: str = Field(min_length=1)
-    answerable_question: Answerable
+    answerable_question: Answerable | None
     trajectory_sha256: str
     twin: Twin
     evidence: dict[str, Any]
@@ -152,10 +172,13 @@ class SceneSpec(BaseModel):
         unknown_labels = sorted(set(self.aliases.values()) - set(self.labels))
         if unknown_labels:
             raise ValueError(f"aliases point to unknown labels {unknown_labels}; labels are {self.labels}")
-        if self.answerable_question.answer not in self.answerable_question.labels:
-            raise ValueError(
-                f"answerable_question: answer {self.answerable_question.answer!r} is not one of its labels"
-            )
+        aside = self.answerable_question
+        if aside is not None and aside.answer not in aside.labels:
+            raise ValueError(f"answerable_question: answer {aside.answer!r} is not one of its labels")
+        if self.is_recorded:
+            return self
+        if aside is None:
+            raise ValueError("answerable_question: is missing")
         is_cut = self.void_kind == "truncation"
         if (self.twin.params is None) != is_cut or (self.twin.rollout is not None) != is_cut:
             raise ValueError("twin: an occluder's has `params` and no `rollout`, a truncation's has a `rollout` alone")
@@ -163,8 +186,13 @@ class SceneSpec(BaseModel):
 
     @model_validator(mode="after")
     def _what_decides_the_pixels_is_plausible(self) -> SceneSpec:
-        physics = check_camera_and_physics(self.camera, self.physics)
-        void = _checked(_Truncation if self.void_kind == "truncation" else _Occluder, "void", self.void)
+        if self.is_recorded:
+            physics = _checked(_Footage, "physics", self.physics)
+            _checked(_Recording, "params", self.params)
+        else:
+            physics = check_camera_and_physics(self.camera, self.physics)
+        hiding = _RecordedVoid if self.is_recorded else _Occluder
+        void = _checked(_Truncation if self.void_kind == "truncation" else hiding, "void", self.void)
         frame = void.cut_frame if isinstance(void, _Truncation) else void.hidden_from_frame
         frames = {"void": frame}
         if self.control is not None:
@@ -174,6 +202,11 @@ class SceneSpec(BaseModel):
             if at >= physics.duration_s * physics.fps:
                 raise ValueError(f"{name}: frame {at} is not in a clip of {physics.duration_s} s at {physics.fps} FPS")
         return self
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether the clips are somebody's video, with no physics behind them."""
+        return self.family == RECORDED
 
     @property
     def closes_frame(self) -> int | None:
