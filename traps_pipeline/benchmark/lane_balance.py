@@ -71,9 +71,8 @@ def telling_numbers(specs: Iterable[TwoEventsSpec]) -> list[str]:
     lanes = Counter((rows := lane_numbers(specs))["family"])
     whole = rows.loc[[lanes[family] >= len(SIDES) * FAMILY_LANES for family in rows["family"]]]
     found = [(number, value, LARGEST_AUC, "") for number, value in balance(rows)[["number", "auc"]].to_numpy()]
-    if len(whole):
-        worst = balance(whole)[["number", "family_auc", "family"]].to_numpy()
-        found += [(number, value, LARGEST_FAMILY_AUC, f" of {family}") for number, value, family in worst]
+    worst = balance(whole)[["number", "family_auc", "family"]].to_numpy() if len(whole) else ()
+    found += [(number, value, LARGEST_FAMILY_AUC, f" of {family}") for number, value, family in worst]
     return [
         f"two events: {number} tells hidden lanes{family} from seen ones (AUC {value:.2f}, {1 - limit:g} to {limit:g} "
         "are allowed)"
