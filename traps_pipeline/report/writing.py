@@ -1,8 +1,7 @@
 """Write tables and figures in all formats, with the same bytes on every build.
 
 A `PrintedTable` is a frame of numbers with printed columns; it becomes Parquet and CSV (unrounded numbers), LaTeX,
-Markdown, text for a terminal and an HTML fragment (printed numbers). Its texts are untrusted: each medium escapes them.
-A figure becomes PDF, SVG and PNG.
+Markdown, text for a terminal and HTML (printed numbers). Its texts are untrusted: each medium escapes them.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ FIGURE_KINDS = ("pdf", "svg", "png")
 COLUMN_IN, PAGE_IN = 3.3, 6.8  # widths of a figure of one column, and of two
 # Okabe and Ito's palette without its yellow, which is too light for a hollow marker, and with its black as grey.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#4D4D4D")
-# 7 colours x 13 shapes distinguish 91 models.
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h", "*", "d")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", ">", "h", "*", "d")  # with 7 colours: 91 models
 INK, SOFT, GRID = "#1b1f27", "#667085", "#d0d5dd"
 
 # A range is a text of two numbers; it is aligned and linked like a number.
@@ -82,9 +80,7 @@ def fraction(value: float | None, digits: int = 3) -> str:
 
 def percent(value: float | None, digits: int = 1) -> str:
     """Return a share (0 to 1) in percent, without the sign."""
-    import pandas as pd
-
-    return NONE if value is None or pd.isna(value) else fraction(100 * value, digits)
+    return fraction(None if value is None else 100 * value, digits)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -315,8 +311,7 @@ def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None
 
 def _classes(column: Column) -> str:
     """Return the style classes of a column's cells."""
-    is_range = column.interval or column.unit == "range"
-    names = ("" if column.is_number else "word", "range" if is_range else "", column.look)
+    names = ("" if column.is_number else "word", "range" * (column.interval or column.unit == "range"), column.look)
     return " ".join(filter(None, (*names, "first" if column.group else "")))
 
 
