@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.prompt_batches import Prompt, collate
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
-from traps_pipeline.models.local.shared_prompts import sharing_prompts
 from traps_pipeline.models.reading.first_token import MAX_ALTERNATIVES
 
 if TYPE_CHECKING:
@@ -20,7 +19,6 @@ class DecodingModel(Protocol):
     """The parts of a `LocalModel` that decoding needs."""
 
     network: Any
-    blocks: Any
 
     def placed(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs on the model's device."""
@@ -29,11 +27,6 @@ class DecodingModel(Protocol):
 
 class Steers(Protocol):
     """Anything that changes hidden states in a pass, as `mechanism.hook.Steering`."""
-
-    @property
-    def layer(self) -> int:
-        """The block whose output it changes."""
-        ...
 
     def rows(self, chosen: Sequence[int]) -> Steers:
         """Return the steering of some of the prompts."""
@@ -60,12 +53,11 @@ def decode(
     """Return answers' tokens (greedy without `sampling`), also those after an end, and first-token log-probs."""
     import torch
 
-    transformers, pad = load_transformers(), model.network.generation_config.pad_token_id
-    inputs: dict[str, Any] = model.placed(collate(prompts, pad))
+    transformers = load_transformers()
+    inputs: dict[str, Any] = model.placed(collate(prompts, model.network.generation_config.pad_token_id))
     first = _FirstToken()
     processors = [first, SeededNucleus(sampling)] if sampling else [first]
-    same_up_to = 0 if steering is None else steering.layer
-    with torch.inference_mode(), sharing_prompts(model, prompts, same_up_to, pad), steering_context(steering, model):
+    with torch.inference_mode(), steering_context(steering, model):
         sequences = model.network.generate(
             **inputs,
             max_new_tokens=max_new_tokens,

@@ -39,12 +39,6 @@ def unknown_path(config: Any, block: Module) -> str | None:
     return None
 
 
-def has_other_paths(config: Any) -> bool:
-    """Return whether blocks read more than the stream and all earlier keys and values."""
-    kinds = {*(getattr(config, "layer_types", None) or ["full_attention"])}
-    return kinds != {"full_attention"} or any(getattr(config, field, 0) for field in (*_FIELDS, "sliding_window"))
-
-
 def argument_of(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Return a call's argument of a block; None if it is missing from either."""
     names = _arguments(type(block))
