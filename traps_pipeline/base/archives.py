@@ -1,7 +1,5 @@
 """Pack and unpack zip archives: equal content gives equal bytes, and any damage is one error."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zipfile

@@ -1,7 +1,5 @@
 """Cache values in memory up to a number of bytes; the least recently used one goes first."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable
 from threading import Lock

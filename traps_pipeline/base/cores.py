@@ -1,7 +1,5 @@
 """Count the cores of this process, or those that a cluster reserved for its run."""
 
-from __future__ import annotations
-
 import os
 
 CORES = "TRAPS_CORES"  # set by the submitter of a run on a cluster

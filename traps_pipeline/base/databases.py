@@ -1,7 +1,5 @@
 """Translate database errors into a reason and a remedy that quote no statement."""
 
-from __future__ import annotations
-
 import re
 import sqlite3
 

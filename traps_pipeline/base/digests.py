@@ -1,7 +1,5 @@
 """Hash values as SHA-256 of canonical JSON, everywhere in the same way."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Define the exception that the command line prints without a traceback."""
 
-from __future__ import annotations
-
 from traps_pipeline.base.redaction import redact
 
 

@@ -1,7 +1,5 @@
 """Declare the optional dependencies (`extras`), and name one that is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """Write files atomically: a file is complete or absent."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -4,8 +4,6 @@ This is the one place that reads them. A key in a file is refused too: what an e
 workspace and releases.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import unicodedata

@@ -1,7 +1,5 @@
 """Validate names that users choose, of models, judges, benchmarks and the like."""
 
-from __future__ import annotations
-
 import re
 from contextlib import suppress
 from functools import lru_cache

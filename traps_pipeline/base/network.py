@@ -1,7 +1,5 @@
 """Check the proxy and certificate variables that client libraries read unasked."""
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import ssl

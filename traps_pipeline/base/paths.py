@@ -4,8 +4,6 @@ They are top-level folders of the repository, and a wheel carries them inside th
 this module, so that the same code runs from a checkout and from a wheel.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

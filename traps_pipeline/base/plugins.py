@@ -3,8 +3,6 @@
 A package names each in its entry points (docs/scenes.md, docs/models.md); nothing of it is imported before its use.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache

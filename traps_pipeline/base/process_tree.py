@@ -5,8 +5,6 @@ for the second. Each adopts the orphans below it (PR_SET_CHILD_SUBREAPER), so th
 the other one leaves running. Linux only; elsewhere the command is one process.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

@@ -5,8 +5,6 @@ has read (`remember`), and those whose names say so. They are found verbatim, in
 base64 or in hexadecimal, also when white space, quotes or line breaks split them, and when either end is cut off.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re

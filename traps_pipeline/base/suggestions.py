@@ -1,7 +1,5 @@
 """Suggest the known word nearest to an unknown one, for error messages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 _LIKENESS = 0.6

@@ -1,7 +1,5 @@
 """Make hidden characters in untrusted text visible, and format tables."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

@@ -5,8 +5,6 @@ user's name. The guard admits a request that carries the token of the printed ad
 server, and lets it change something only by a POST of JSON.
 """
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import secrets

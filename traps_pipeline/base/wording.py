@@ -1,7 +1,5 @@
 """Write counts and shares in words, the same way in every command and page."""
 
-from __future__ import annotations
-
 
 def count_noun(count: int, singular: str, plural: str | None = None) -> str:
     """Return a count with its noun: `1 family`, `2,340 scenarios`. plural: default, the singular with an s."""

@@ -1,7 +1,5 @@
 """Render in recycled worker processes, one per core; yield results in job order."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -3,8 +3,6 @@
 Anything that two readers could read differently (a duplicate key, `yes`, `1:30`, `010`, `.inf`) is refused.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

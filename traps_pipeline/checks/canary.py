@@ -5,8 +5,6 @@ reader on both sides isolates changes of the model. Answers are sampled, so some
 changes between two quiet epochs measures that.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

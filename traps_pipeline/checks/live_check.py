@@ -5,8 +5,6 @@ once with the clip and once without, and in its JSON form if a run may ask for i
 known votes. Every problem is a sentence that names the cause and the remedy.
 """
 
-from __future__ import annotations
-
 import asyncio
 import re
 import time

@@ -1,7 +1,5 @@
 """Say what this machine has for local models (`traps doctor --local`): devices, NF4, weights."""
 
-from __future__ import annotations
-
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.extras import install_line, missing
 from traps_pipeline.models.local.library import load_transformers

@@ -1,7 +1,5 @@
 """Run a fake provider on this machine that records a backend's requests."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """Check key, address and list of models of a server before it is asked."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any

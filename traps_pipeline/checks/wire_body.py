@@ -1,7 +1,5 @@
 """Parse request bodies into one form; list each API's fields for parameters."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ studies use, the request is recorded on this machine, and its body must consist 
 parameters, and nothing else. No key is needed, and nothing leaves the machine.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence

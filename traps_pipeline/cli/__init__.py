@@ -1,7 +1,5 @@
 """Build the `traps` command; each other file defines one group of commands."""
 
-from __future__ import annotations
-
 import argparse
 import atexit
 import gc

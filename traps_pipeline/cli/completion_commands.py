@@ -1,7 +1,5 @@
 """Print a shell's completion script (`traps completion`)."""
 
-from __future__ import annotations
-
 import argparse
 
 from traps_pipeline.base.paths import ASSETS

@@ -1,7 +1,5 @@
 """Check whether this machine meets a study's requirements (`traps doctor`)."""
 
-from __future__ import annotations
-
 import argparse
 
 from traps_pipeline.base.extras import require

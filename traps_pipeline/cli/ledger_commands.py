@@ -1,7 +1,5 @@
 """Export or import a study's ledger, move a study, or release money."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

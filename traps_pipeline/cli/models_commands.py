@@ -1,7 +1,5 @@
 """Check what models and judges send and answer (`traps models`)."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Collection, Sequence
 

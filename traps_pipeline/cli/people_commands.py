@@ -1,7 +1,5 @@
 """Serve review and labelling pages, and validate judges (`traps people`)."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

@@ -1,7 +1,5 @@
 """Write and verify releases, submissions and leaderboards (`traps publish`)."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

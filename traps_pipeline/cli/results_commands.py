@@ -1,7 +1,5 @@
 """Write, audit and compare results, with the explorer (`traps results`)."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Serve a study's Dagster pages to the person who started it (`traps ui`)."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

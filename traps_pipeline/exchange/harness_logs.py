@@ -4,8 +4,6 @@ They name an item and a regime, not a ledger key. The importing user says which 
 which run. All of it is untrusted data: sizes are bounded, nothing is executed.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zipfile

@@ -5,8 +5,6 @@ for all regimes and runs. Providers differ in the addresses that they read: Open
 Gemini the URI of its File API or of Cloud Storage, vLLM https, and file:// below `--allowed-local-media-path`.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from collections.abc import Mapping

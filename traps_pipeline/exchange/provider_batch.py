@@ -5,8 +5,6 @@ exactly like the live call's: the backend gets it from this machine, with the pr
 the same rows.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ Everything is counted per dataset and task over all models, regimes and runs. An
 reason: if all votes are of one class, agreement beyond chance is undefined.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 from typing import Any

@@ -6,8 +6,6 @@ sample consists of the n failures with the smallest digests. It is uniform and i
 that appears or disappears changes at most one member, so that nearly all paid labels are reused.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any

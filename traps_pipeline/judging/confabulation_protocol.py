@@ -3,8 +3,6 @@
 Nothing here asks a judge: `traps status` reads the protocol's digest, and the study's partitions follow its models.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path

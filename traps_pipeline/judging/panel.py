@@ -4,8 +4,6 @@ A judge sees the question, the answer's visible text and, for correctness, the g
 the side or the regime. The answer is data: it stands between markers that it cannot predict.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

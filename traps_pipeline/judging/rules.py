@@ -4,8 +4,6 @@ Like any judge it reads the rendered user message and answers with the JSON that
 `unread`. It never guesses; docs/judging.md, "The rule judge" lists the forms that it reads.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

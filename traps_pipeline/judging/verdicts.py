@@ -1,7 +1,5 @@
 """Decide every answer by the panel's majority (docs/spec.md 4.1)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import groupby
 

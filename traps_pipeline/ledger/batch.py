@@ -1,7 +1,5 @@
 """Collect a ledger transaction: rows, their totals, and the money they move."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

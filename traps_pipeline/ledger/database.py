@@ -4,8 +4,6 @@ Changes are queued, and one thread applies all waiting ones in one transaction. 
 What differs between databases is in `sqlite.py` and `traps_cluster/postgres.py`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import secrets
 import threading

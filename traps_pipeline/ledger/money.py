@@ -3,8 +3,6 @@
 The transaction that stores a call's row removes its reservation (docs/design/money.md).
 """
 
-from __future__ import annotations
-
 import secrets
 from asyncio import CancelledError
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Copy a ledger verbatim: to a file, from a file, or into hosts' shared database. What is damaged stays behind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from itertools import groupby

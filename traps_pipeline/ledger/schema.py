@@ -5,8 +5,6 @@ call is sent, and the transaction that stores its answer deletes that row and ad
 totals' dollars, less the failed ones of `releases`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import sqlalchemy as sa

@@ -4,8 +4,6 @@ A commit survives a kill of the process at once, and a power cut from the next `
 disk: SQLite's write-ahead log does not work over a network.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sqlite3

@@ -5,8 +5,6 @@ have the same controls, their common noise makes it too large. Products of *diff
 disattenuated cosine uses only them. The split half says how far other pairs give the same direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

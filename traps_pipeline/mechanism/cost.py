@@ -4,8 +4,6 @@ The estimate is arithmetic with constants that were measured on one card: a pass
 token, and decoding steps are bound by each block's kernels or by reading the weights. docs/mechanism.md states both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 

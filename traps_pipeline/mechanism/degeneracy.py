@@ -1,7 +1,5 @@
 """Detect degenerate steered texts, which judges could call abstention or answer."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections import Counter

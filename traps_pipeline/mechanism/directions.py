@@ -9,8 +9,6 @@ from three distributions and made orthogonal to it, so that no null contains a p
   projection it would lie along the direction or its reverse: with ten pairs its cosine often exceeds 0.7.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Build GATE rows from stored states and verdicts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product

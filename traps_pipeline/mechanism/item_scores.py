@@ -4,8 +4,6 @@ Every score of states comes from a probe that was fitted without the item's scen
 item's dataset, relative to the probe's own mid threshold (half-way between the sides' means).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

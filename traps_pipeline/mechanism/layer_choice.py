@@ -7,8 +7,6 @@ either side counts, so no label of its voids does. Its controls are those of its
 one taxonomy count as fitted without the scored scenario (`held_out`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ which are answerable items (`LOOK_ALIKES`) in the place of a dataset's voids. Wh
 the model's, or none of what cannot be known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

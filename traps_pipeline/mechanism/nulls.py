@@ -4,8 +4,6 @@ The paper adds a direction on controls and subtracts it on voids, which requires
 given for adding, or subtracting, on both sides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Fit other probes for `traps_pipeline.inside.protocol`, and erase a concept."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

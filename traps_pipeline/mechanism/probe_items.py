@@ -1,7 +1,5 @@
 """List clips and questions whose hidden states are read: pairs, and controls."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

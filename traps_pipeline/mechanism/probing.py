@@ -3,8 +3,6 @@
 Layers are read one at a time: at the 8B size one layer of all items takes 46 MB, all of them 1.7 GB.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field

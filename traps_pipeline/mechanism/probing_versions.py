@@ -1,7 +1,5 @@
 """Version settings, prompts and precision of mechanistic stages, without torch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -5,8 +5,6 @@ the variation of scenarios. Several paths ask the same scenario, and one answer 
 over paths therefore resample scenarios, not answers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import product
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """List ordered pairs of datasets with transfer types (docs/spec.md 7.2 and 8.3)."""
 
-from __future__ import annotations
-
 from itertools import permutations, product
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Choose the frames shown in a dataset that varies them (docs/hypotheses.md), and the size of wide clips."""
 
-from __future__ import annotations
-
 from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDE, WIDTH
 from traps_pipeline.storage.media import MediaSpec

@@ -6,8 +6,6 @@ the shares are resampled together: a resampled scenario takes its labelled answe
 uncertainty of both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, cast
 

@@ -4,8 +4,6 @@ Labels of all people are pooled. A label is weighted by the size of its stratum 
 clips chosen because the judges are split about them count no more than they do in the study.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@
 sample id replaces model and item. Their labels come back as one CSV file with a line per annotator and failure.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

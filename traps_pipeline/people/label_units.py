@@ -6,8 +6,6 @@ that split the judges, and the others. The units with the smallest digests of a 
 stratum are a random sample of it, and figures can weight each stratum by its share in the study.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Literal, get_args

@@ -4,8 +4,6 @@
 same person about the same unit replaces the earlier one. Stages read only that file.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from datetime import datetime

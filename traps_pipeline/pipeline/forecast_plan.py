@@ -1,7 +1,5 @@
 """Plan an experiment (`traps plan`): calls, tokens, dollars, minutes, GPU-hours."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@
 and `plan` read only this graph and the tables' footers, and `pipeline.assets` builds Dagster's assets from it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property

@@ -1,7 +1,5 @@
 """Report partitions and sources to Dagster, and read back versions and provenance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any

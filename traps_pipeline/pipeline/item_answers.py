@@ -1,7 +1,5 @@
 """Explain which answers to an item are valid and which are stale (`traps why`)."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 The tables' footers (`storage.parquet.State`) hold the versions of the inputs (docs/design/staleness.md).
 """
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set

@@ -1,7 +1,5 @@
 """Build a stage's partitions in one run, alone or concurrently with other runs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 

@@ -1,7 +1,5 @@
 """Translate what Dagster shows: hidden characters become visible, files are named from the study's folder on."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Evaluate the checks of a stage's partitions, for Dagster and a run's report."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any

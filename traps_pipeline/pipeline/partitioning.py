@@ -3,8 +3,6 @@
 Importing Dagster takes longer than `traps status`; `pipeline.translation` translates these classes into Dagster's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

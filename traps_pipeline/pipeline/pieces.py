@@ -4,8 +4,6 @@ The report is one page of a hundred tables, figures and pictures. Each is a piec
 the asset's state, together with digests of its inputs.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Materialize missing or stale partitions, one Dagster run per block of stages."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import time

@@ -1,7 +1,5 @@
 """Execute Dagster runs, one after another here or on the hosts of a cluster."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Partition the study that `TRAPS_WORKSPACE` names."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from functools import cache
 

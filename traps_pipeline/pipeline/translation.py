@@ -1,7 +1,5 @@
 """Translate the graph into Dagster's asset keys, partitions and mappings."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from functools import cache

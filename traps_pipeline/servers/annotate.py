@@ -4,8 +4,6 @@ Only the server knows the identity of the shown unit. A browser gets a question,
 for one person and one unit: no model, regime, side, dataset or scenario is ever sent, and no address names a file.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Find near duplicates: scenarios of a family whose control clips look alike."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass

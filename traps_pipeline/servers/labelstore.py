@@ -5,8 +5,6 @@ confirmed label. A label that a kill leaves between the two steps is appended wh
 database is lost, labels are restored from the file.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hmac
 import json

@@ -1,7 +1,5 @@
 """Queue the scenarios of a review: which are shown, and in which order."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 

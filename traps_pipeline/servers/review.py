@@ -1,7 +1,5 @@
 """Serve `traps people review`, and append decisions to the corrections."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Mapping

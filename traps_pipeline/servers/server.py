@@ -4,8 +4,6 @@ Only files that a study's tables name are served. The guard (`webguard`) admits 
 foreign hosts, foreign origins and every change that is not a POST of JSON.
 """
 
-from __future__ import annotations
-
 import hashlib
 from base64 import b64encode
 from collections.abc import Mapping

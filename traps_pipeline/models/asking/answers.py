@@ -1,7 +1,5 @@
 """Turn a cell's items into the rows of its table of responses, one per item."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The same code asks models and judges, reference ones and paid ones. There is no 
 correction are the same operation (docs/models.md, "Ledger").
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence

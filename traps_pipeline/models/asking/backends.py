@@ -1,7 +1,5 @@
 """Create the backend of a registry entry, in this one place."""
 
-from __future__ import annotations
-
 import inspect
 from dataclasses import dataclass, replace
 from typing import get_args

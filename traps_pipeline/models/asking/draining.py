@@ -1,7 +1,5 @@
 """Stop asking on Ctrl-C, SIGTERM and SIGHUP, once the calls in flight are answered."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

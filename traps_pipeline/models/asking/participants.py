@@ -3,8 +3,6 @@
 This is the one place that sends calls; `models/asking/ask.py` decides which.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import random

@@ -5,8 +5,6 @@ once its cell is done, and then one that was answered. If the former is refused 
 item is refused: credit, key and server were well (docs/models.md, "Calls").
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping

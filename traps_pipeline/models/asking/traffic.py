@@ -1,7 +1,5 @@
 """Pace calls by connections, rate limits and a breaker; no answer is affected."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """Answer by classical vision (the observer), the leaderboard's upper-bound row."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

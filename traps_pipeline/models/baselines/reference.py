@@ -4,8 +4,6 @@ Only they see a request's `secret` (side, ground truth, labels). Their random ch
 crash and a second run give the same answers.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping

@@ -4,8 +4,6 @@ A cue uses the clip or the question alone, never the record. Without its cue a r
 that has none the commonest answer of the sub-scenario: it abstains by its cue alone.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from functools import lru_cache

@@ -10,8 +10,6 @@ and its decoder (`get_decoder()`) has `layers` and `norm`; anything else is refu
 once: one prompt's hooks would see another's states (`backend` uses one worker thread for all models).
 """
 
-from __future__ import annotations
-
 import gc
 from collections import OrderedDict
 from dataclasses import replace

@@ -3,8 +3,6 @@
 For callers it is like an API: one request, one outcome, one row of the ledger. So a crash loses only the running batch.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -3,8 +3,6 @@
 The library's sandbox lets a template run no code of its own, but loop for ever and ask for any memory.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -1,7 +1,5 @@
 """Load torch and transformers, quietly and in the right order, only here."""
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import os

@@ -5,8 +5,6 @@ folder for an account. The folder's `budget.yaml` gives the cap; `spent.json` ho
 reserved, which every process replaces under a lock that it holds for that moment only.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 from collections.abc import Iterator, Mapping

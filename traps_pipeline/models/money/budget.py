@@ -3,8 +3,6 @@
 The reservation is a row of the ledger's database (`ledger/money.py`, docs/design/money.md).
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 Means over a participant's ledger rows come first; without any, the registry's estimates apply.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress

@@ -3,8 +3,6 @@
 `traps plan` uses them; a budget reserves an entry's `tokens_per_frame`, an upper bound.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import ceil
 

@@ -4,8 +4,6 @@ A call in flight when its process died, and a failed one that may be billed, cou
 person who has checked the provider's bill releases them; the ledger records who, when and why.
 """
 
-from __future__ import annotations
-
 import getpass
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -4,8 +4,6 @@ An unlisted reason is never an answer. Gateways pass on the reasons of other pro
 all dialects.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Read the log-probabilities of an answer's first token (docs/arms.md)."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ nothing again. A text that is no answer has an outcome of its own and reaches no
 abstention.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Decide correctness: compare a value with the ground truth (docs/spec.md 4.3)."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

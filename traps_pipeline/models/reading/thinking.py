@@ -1,7 +1,5 @@
 """Strip an answer's marked thinking, code fence, and leftover special tokens."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

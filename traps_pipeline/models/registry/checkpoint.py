@@ -1,7 +1,5 @@
 """Find and identify a local checkpoint (no download); check that it fits memory."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Register judges and panels (`assets/judges.yaml`), with prompts and schemas."""
 
-from __future__ import annotations
-
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache

@@ -4,8 +4,6 @@ Each would change what is asked, how many answers are paid for, or the form in w
 the budget and the reader go on as before.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any

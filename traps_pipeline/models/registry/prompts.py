@@ -1,7 +1,5 @@
 """Read regimes' and judges' system prompts, verbatim (docs/spec.md 3.3)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Define JSON schemas of the objects asked of providers (structured output)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

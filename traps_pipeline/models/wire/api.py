@@ -4,8 +4,6 @@ Retries, pace and money are handled elsewhere (`ask`). litellm is imported on th
 fetch a price list from the network.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import warnings

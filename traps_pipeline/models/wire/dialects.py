@@ -4,8 +4,6 @@ litellm builds and sends requests. Its view of a response is not used: it turns 
 loses refusals and parts.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

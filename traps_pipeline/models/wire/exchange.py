@@ -4,8 +4,6 @@ The transport (`models/wire/httpx_transport.py`) writes it below the client libr
 errors that look unbilled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar

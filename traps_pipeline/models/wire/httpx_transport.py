@@ -5,8 +5,6 @@ the status of the answer, and the answer's bytes. Loopback addresses bypass prox
 attempt sends one request at most, an answer is read up to a bound, and no compression is requested.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import ssl

@@ -4,8 +4,6 @@ Gateways add long headers, count a body twice, or write names that are none. The
 the parser sees it: what it would refuse is left out, and what says where the body ends is written once.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import Any

@@ -3,8 +3,6 @@
 Tables say where providers put them (`_PLACES`, `_WAIT_HEADERS`) and what their words mean (`_MEANINGS`).
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

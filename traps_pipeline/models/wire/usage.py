@@ -4,8 +4,6 @@ It is read from the raw answer, since litellm replaces missing counts by zeros. 
 call with unknown tokens counts as its worst case (docs/models.md, "Money").
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Declare the report group: report page and explorer in the folder `reports`."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from traps_pipeline.pipeline.graph import Parent
