@@ -57,10 +57,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _chosen_names(arguments: argparse.Namespace) -> dict[str, bool]:
-    """Return ids of named models and judges, and of panels and experiments; whether one may be asked for JSON.
-
-    The workspace's own entries are known too. Raises TrapsError for a panel that cannot vote, named or not.
-    """
+    """Return ids that these names stand for, and whether one may be asked for JSON. Raises TrapsError."""
     from traps_pipeline.models.registry.judges import load_panel, load_panels
     from traps_pipeline.pipeline.experiment import load_experiment
     from traps_pipeline.storage.workspace import Workspace

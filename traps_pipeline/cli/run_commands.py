@@ -162,10 +162,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _require_stages(until: str, workspace: Workspace, *, is_new: bool) -> None:
-    """Raise TrapsError for unknown stages, and take away a workspace that this command has just made.
-
-    The stages are declared with the keys of its study, so that it must be there before they are known.
-    """
+    """Raise TrapsError for stages that the study does not declare; remove a workspace that was just made."""
     load_definitions()
     from traps_pipeline.pipeline.run_plan import stages_until
 

@@ -146,10 +146,7 @@ def export_requests(workspace: Workspace, experiment: Experiment, out: Path) -> 
 
 
 def _cells(workspace: Workspace, experiment: Experiment) -> list[Cell]:
-    """Return the experiment's cells whose datasets have items, or raise TrapsError.
-
-    A study of one taxonomy has items of two of the four datasets.
-    """
+    """Return the experiment's cells whose datasets have items, or raise TrapsError."""
     cells = [cell for cell in experiment.cells() if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     if not cells:
         raise TrapsError(f"{workspace.root}: no items yet; materialize scene_specs, videos and items first")
@@ -344,10 +341,7 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
 def _answers_by_item(
     imported: Iterable[LoggedAnswer], requested: Mapping[str, Request], context: AnswerContext
 ) -> tuple[dict[str, Answer], int]:
-    """Return a harness's answers by key, and how many calls have no answer anywhere.
-
-    Epochs of a harness are runs from `context.run` on. Raises TrapsError naming (up to five) wrong or unwanted answers.
-    """
+    """Return a harness's answers by key, and how many calls have none. Raises TrapsError for unwanted ones."""
     models = sorted({request.participant for request in requested.values()})
     model = context.model or (models[0] if len(models) == 1 else None)
     if model not in models:

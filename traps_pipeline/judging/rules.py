@@ -114,11 +114,7 @@ def _in_object(answer: Mapping[str, Any], question: str) -> Statement | None:
 
 
 def _in_text(text: str, question: str) -> Statement | None:
-    """Read a text that is, ends with, or begins with a statement.
-
-    If it begins with one, its second sentence explains it. No other sentence may announce another answer, and no choice
-    of the question may stand before a sentence that declines.
-    """
+    """Read a text that is, ends with, or begins with the only statement that it makes."""
     sentences = [part for part in _SENTENCE_END.split(_MARKUP.sub("", text).strip()) if part]
     wording, last = f" {words_of(question)} ", len(sentences) - 1
     statements = dict[int, Statement | None]()

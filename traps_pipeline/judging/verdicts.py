@@ -128,10 +128,7 @@ def _rejects_premise(rows: pd.DataFrame, votes: pd.DataFrame, n_judges: int) -> 
 
 
 def _overruled(rows: pd.DataFrame, votes: pd.DataFrame) -> pd.arrays.BooleanArray:
-    """Return whether code differs from some judge's own word on correctness, (rows,), null without such a word.
-
-    Rules have no word of their own.
-    """
+    """Return whether code differs from some judge's own word on correctness, (rows,), null without such a word."""
     rules = [panel for panel in votes["panel"].unique() if is_of_rules(panel.partition("@")[0])]
     has_word = votes["judge_correct"].notna() & votes["correct"].notna() & ~votes["panel"].isin(rules)
     words = votes.loc[has_word, [*ANSWER, "judge_correct", "correct"]]

@@ -136,10 +136,7 @@ class Batch:
             collected.clear()
 
     def _execute(self, statement: sa.Executable, *values: dict[str, Any]) -> Any:
-        """Execute a statement for each of `values` by the driver, and return its cursor.
-
-        SQLAlchemy's own way takes more time than SQLite itself.
-        """
+        """Execute a statement for each of `values` by the driver, faster than SQLAlchemy; return its cursor."""
         cursor, driver = self.connection.connection.cursor(), self.connection.dialect.loaded_dbapi
         if values:
             sql = _compiled(statement, self.connection.dialect, tuple(values[0]))

@@ -264,7 +264,7 @@ def _clips(subject: Subject) -> str:
 
 def _batches(subject: Subject) -> str:
     model, prompts = subject.model, subject.prompts
-    again, push = [prompts[0], *prompts, prompts[0]], subject.steered(0.5, -0.5, 0.5, 0.5, 0.5)  # equal prompts share
+    again, push = [prompts[0], *prompts, prompts[0]], subject.steered(0.5, -0.5, 0.5, 0.5, 0.5)
     steered = model.generate(again, NEW_TOKENS, steering=push)
     alone = [model.generate([prompt], NEW_TOKENS, steering=push.rows([n]))[0] for n, prompt in enumerate(again)]
     _require([a.tokens for a in steered] == [a.tokens for a in alone], "a steered answer depends on its batch")

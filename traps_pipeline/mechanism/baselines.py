@@ -143,10 +143,7 @@ def raw_features(
 
 
 def _thumbnails(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return thumbnails and times of the shown frames, and the clip's last time.
-
-    Thumbnails (N, h, w, 3) in [0, 1], times (N,); the last time is that of the clip's last frame.
-    """
+    """Return shown frames' thumbnails (N, h, w, 3) in [0, 1] and times (N,), and the time of the clip's last frame."""
     import cv2
 
     try:

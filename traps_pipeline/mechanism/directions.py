@@ -136,10 +136,7 @@ def _null_draws(kind: str, void: np.ndarray, control: np.ndarray, rng: np.random
 
 
 def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return unit vectors (draws, layers, d), less their part along unit (layers, d).
-
-    Zero if hardly anything is left, and if `unit` itself is zero.
-    """
+    """Return unit vectors (draws, layers, d) less their part along unit (layers, d); zero if hardly any is left."""
     remainder = vectors - (vectors * unit).sum(axis=2, keepdims=True) * unit
     remainder -= (remainder * unit).sum(axis=2, keepdims=True) * unit  # again, since the first projection rounds
     norm_before, norm_after = (np.linalg.norm(vector, axis=2, keepdims=True) for vector in (vectors, remainder))

@@ -32,10 +32,7 @@ def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
 
 
 def _with_changes(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return effects with `moved`, the change against unsteered answers.
-
-    It is in the claimed direction: more abstention on controls, and less on voids.
-    """
+    """Return effects with `moved`: more abstention on controls, less on voids, against unsteered answers."""
     path = [*_CELL, "target", "kind", "draw", "layer", "unit", "side"]
     unsteered_effects = effects.loc[effects["dose"] == 0, [*path, "abstention"]].rename(columns={"abstention": "plain"})
     steered_effects = effects.loc[effects["dose"] != 0].merge(unsteered_effects, on=path)

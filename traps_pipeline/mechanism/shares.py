@@ -63,11 +63,7 @@ def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame, fluency: pd.Dat
 
 
 def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
-    """Return the answers with `abstained` and `correct`, the majority's decisions.
-
-    They are null without a text, votes or a majority, and `correct` on voids. Each cell is decided by itself: after a
-    change of panel, a cell keeps votes of the old panel until the new votes are made.
-    """
+    """Return the answers with `abstained` and `correct` of each cell's own votes; null where no majority decides."""
     votes_on, no_votes = dict(iter(votes.groupby(_CELL))), votes.head(0)
     parts: list[pd.DataFrame] = []
     for cell, cell_answers in answers.groupby(_CELL, sort=False):
@@ -160,10 +156,7 @@ def share_rows(
 
 
 def _shares(numbered: pd.DataFrame, n_paths: int, resamples: int, seed: int) -> np.ndarray:
-    """Return ends of each path's share, (2, paths, 1 + resamples), observed first.
-
-    An answer in several paths is one answer, so all paths of a taxonomy have one unseen scenario.
-    """
+    """Return ends of each path's share, (2, paths, 1 + resamples), observed first; paths share one unseen scenario."""
     ends = np.empty((2, n_paths, 1 + resamples))
     numbered = numbered.assign(taxonomy=numbered["dataset"].map(taxonomy_of))
     resampling = draw_scenarios(numbered, resamples, seed)

@@ -150,11 +150,7 @@ class _Planned(NamedTuple):
 
 
 def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Container[str]) -> list[_Planned]:
-    """Return every direction along which a target is steered, among these sources.
-
-    These are all paths into it; along its own direction also the other sign policies, the nulls, and on
-    controls the sweep over layers.
-    """
+    """Return all paths into a target from these sources; along its own direction also signs, nulls and the sweep."""
     alphas: tuple[Dose, ...] = tuple(("alpha", float(alpha)) for alpha in steering.alphas)
     doses: tuple[Dose, ...] = (*alphas, *(("gap", float(gap)) for gap in steering.gaps))
     steered_layer = layers.steering

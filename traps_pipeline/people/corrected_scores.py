@@ -90,11 +90,7 @@ def rogan_gladen(share: np.ndarray, sensitivity: np.ndarray, specificity: np.nda
 
 
 def _corrected_ends(share: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return the ends of a corrected share, (2, draws).
-
-    They come from the ends of the judged share, (2, draws), and of sensitivity and specificity, (2, 2, draws): the
-    corrected share rises with the judged share and with specificity, and falls with sensitivity.
-    """
+    """Return corrected ends, (2, draws), from ends of the share, (2, draws), and of its errors, (2, 2, draws)."""
     sensitivity, specificity = errors[:, 0], errors[:, 1]
     return rogan_gladen(share, sensitivity[::-1], specificity)
 

@@ -154,10 +154,7 @@ def _report(instance: dg.DagsterInstance, stage: str, key: str | None, wrong: st
 
 
 def _requests(instance: dg.DagsterInstance, plan: RunPlan) -> list[dg.RunRequest]:
-    """Return runs that rebuild outdated partitions, as far as possible now.
-
-    Dependents are requested at a later tick.
-    """
+    """Return runs that rebuild outdated partitions, as far as possible now; dependents follow at a later tick."""
     requests, recorded = list[dg.RunRequest](), cache(History(instance, plan.graph).recorded)
     for block in plan.blocks():
         stages, keys = plan.pending(block, recorded, existing=True)

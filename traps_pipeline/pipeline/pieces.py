@@ -69,10 +69,7 @@ def make_pieces(
 
 
 class _SharedPieces:
-    """An archive in the user's cache folder of the pieces that all studies share.
-
-    If it cannot be read or written, the pieces are built as if it did not exist.
-    """
+    """An archive of all studies' shared pieces in the user's cache folder; if it fails, pieces are built without it."""
 
     def __init__(self, asset: str) -> None:
         self._asset, self._libraries = asset, [*map(version, _DRAWN_BY)]

@@ -114,10 +114,7 @@ def _parts(
 
 
 def _halves(sizes: np.ndarray, cuts: np.ndarray, better: set[int], count: int) -> tuple[int, int]:
-    """Return where to cut lines of these sizes, and how many parts come before.
-
-    Prefer parts of equal size, then a place in `better`, then the middle.
-    """
+    """Return where to cut, and how many parts come before: prefer equal parts, then `better`, then the middle."""
     total = int(sizes.sum())
     first = np.cumsum(sizes)[cuts - 1]
     shares = np.clip(np.rint(count * first / total), 1, count - 1).astype(int)

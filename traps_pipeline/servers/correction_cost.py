@@ -92,10 +92,7 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 
 
 def _evaluation_counts(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
-    """Yield model, dataset of the taxonomy, and its number of evaluations.
-
-    Those that the study's experiments want count.
-    """
+    """Yield model, dataset of the taxonomy, and the number of its evaluations that experiments want."""
     cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
     counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
     yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)

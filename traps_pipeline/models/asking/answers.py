@@ -99,10 +99,7 @@ def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
 
 @lru_cache(maxsize=1)  # a dataset's cells follow one another
 def _item_rows(workspace: Workspace, dataset: str, version: str) -> list[dict[str, Any]]:
-    """Return the items of one version of a dataset.
-
-    Equal texts share one copy: a cell of 100,000 items may have a hundred questions.
-    """
+    """Return the items of one version of a dataset; equal texts share one copy."""
     copies: dict[str, str] = {}
     rows = workspace.tables.read_all(ITEMS, _ITEM_COLUMNS, dataset=dataset).to_dict("records")
     return [
@@ -120,12 +117,7 @@ def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, An
 
 
 def _secret(entry: ModelEntry, item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the hidden facts for reference strategies: side, labels, control's truth.
-
-    Only `prior` and the rules read the sub-scenario's commonest answer, so that a corrected answer which changes it
-    re-asks no other model, and only `bayes` reads the probabilities of answers. A rule reads nothing else, and every
-    other model nothing at all.
-    """
+    """Return hidden facts for reference strategies, to each only those that it reads: other changes re-ask no model."""
     if entry.backend == "rule":
         return {"commonest_answer": item["commonest_answer"]}
     if entry.backend != "reference":

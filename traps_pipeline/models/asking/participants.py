@@ -240,11 +240,7 @@ async def _send(participant: Participant, request: Request, allowed: CallContext
 
 
 def _believed_cost(cost_usd: float | None, worst_usd: float) -> float:
-    """Return an answer's cost, or the worst case if it is unknown or impossible.
-
-    A provider may exceed a call's limits and charge for it, up to a bound: an impossible number of tokens would
-    otherwise end the study.
-    """
+    """Return an answer's cost; the worst case if unknown, and at most a bound, so that no count ends the study."""
     if cost_usd is None or not math.isfinite(cost_usd) or cost_usd < 0:
         return worst_usd
     return min(cost_usd, OVERRUN * worst_usd)

@@ -94,11 +94,7 @@ def phrase(answer: str | None, request: Request) -> str:
 
 
 def _stated_probabilities(answer: str | None, request: Request) -> dict[str, Any]:
-    """Return the probabilities to state with an answer.
-
-    They are those of `bayes`; for others all for the answer, and for an abstention none, which leaves all answers
-    equal.
-    """
+    """Return the probabilities of `bayes`; for others all for the answer, and none for an abstention."""
     probability_of = _belief(answer, request)
     return {"probabilities": [{"answer": label, "probability": round(p, 4)} for label, p in probability_of.items()]}
 

@@ -76,10 +76,7 @@ def load_local_model(entry: ModelEntry, *, inside: bool = False, seed: int | Non
 
 
 def _make_room(checkpoint: Checkpoint, params: LocalParams, device: str) -> None:
-    """Unload a device's least recently used models until the weights fit.
-
-    The memory of a model that a caller still holds is freed only when the caller drops it.
-    """
+    """Unload a device's least recently used models until the weights fit; callers may still hold their memory."""
     import torch
 
     needed_bytes = weight_bytes(checkpoint.folder, params.dtype, params.quantisation)

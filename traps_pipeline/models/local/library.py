@@ -31,11 +31,7 @@ def load_transformers() -> Any:
 
 @cache
 def _declare_torchvision_operators() -> None:
-    """Let torchvision be imported beside a torch without CUDA.
-
-    Video processors resize with torchvision, whose wheel is linked against CUDA: beside a CPU torch its library does
-    not load, and the import then fails at operators that are looked up and never called here. Their schemas are enough.
-    """
+    """Declare operators that torchvision looks up at import: its library of CUDA does not load beside a CPU torch."""
     library = _torchvision_library()
     if library is None:
         return

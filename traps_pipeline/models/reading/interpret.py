@@ -109,20 +109,14 @@ def read_answer(
 
 
 def _has_final_answer(text: str) -> bool:
-    """Return whether a truncated text has a final answer, in or before its object.
-
-    The field of the object must be complete. The object's reason announces nothing.
-    """
+    """Return whether a truncated text has a final answer, before its object or as a complete field of it."""
     brace = _OBJECT.search(text)
     start = brace.start() if brace else len(text)
     return _states_answer(text[:start]) or "final_answer" in _complete_fields(text[start:])
 
 
 def _states_answer(text: str) -> bool:
-    """Return whether a text announces an answer that ends before the text does.
-
-    One at the cut may be incomplete. Where none ends after one announcement, none does after a later one.
-    """
+    """Return whether a text announces an answer that ends before the text does; one at the cut may be incomplete."""
     for stated in _STATED.finditer(text):
         start = max(0, stated.start() - _MAX_BEFORE)
         if _BEFORE.search(f"{'x' if start else ''}{text[start : stated.start()]}"):
@@ -179,10 +173,7 @@ def degenerate(text: str) -> str | None:
 
 
 def _is_json(text: str, fields: Sequence[str]) -> bool:
-    """Return whether a text is an object with the deciding fields, in a fence or not.
-
-    These are `final_answer`, and `abstain` if requested. The reason may have any form.
-    """
+    """Return whether a text is an object, in a fence or not, with `final_answer`, and `abstain` if requested."""
     try:
         value = json.loads(strip_fence(text))
     except (ValueError, RecursionError):

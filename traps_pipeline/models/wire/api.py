@@ -88,10 +88,7 @@ def load_litellm() -> Any:
 
 
 def _hook() -> Any:
-    """Return the hook that keeps litellm from pricing a response by its tables.
-
-    Pricing takes a tenth of a call's CPU time, and the registry has the prices: litellm's number is never read.
-    """
+    """Return the hook that keeps litellm from pricing responses, a tenth of a call's CPU time, by its own tables."""
     logger: Any = import_module("litellm.integrations.custom_logger").CustomLogger
 
     class Hook(logger):
@@ -109,11 +106,7 @@ def client_version() -> str:
 
 @cache
 def _internal_call() -> Any:
-    """Return litellm's own mark of a call that it need not log.
-
-    Its log of every call, which nobody reads here, takes a sixth of a call's CPU time and lags behind, holding what was
-    sent: 5 KB a call without media, unbounded.
-    """
+    """Return litellm's mark of a call that it need not log: its log takes CPU time, and holds what was sent."""
     return import_module("litellm._internal_context").is_internal_call
 
 
@@ -217,10 +210,7 @@ class ApiBackend:
         )
 
     def _cost(self, usage: Usage | None, request: Request) -> float | None:
-        """Return dollars; None if the price or the usage is unknown.
-
-        An implausible usage costs the call's worst case, and no less than the highest of its counts.
-        """
+        """Return dollars; None if price or usage is unknown, and at least the worst case for an implausible usage."""
         if self._entry.prices is None or usage is None:
             return None
         cost, worst_usd = self._entry.prices.cost(usage.prompt, usage.completion), worst_case_usd(self._entry, request)
