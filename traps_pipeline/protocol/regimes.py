@@ -1,7 +1,5 @@
 """Define the regimes: system prompts for models, their texts and answer formats."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

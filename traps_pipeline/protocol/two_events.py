@@ -1,7 +1,5 @@
 """Name the eight items of a scenario of two events, and take their ids apart (docs/arms.md, "Two events")."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Write and verify the SHA-256 of a folder's files, as `sha256sum --check` does."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

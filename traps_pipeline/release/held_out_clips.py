@@ -1,7 +1,5 @@
 """Give each item of a held-out set a clip of its own, which no byte links to another or to the study's."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import struct

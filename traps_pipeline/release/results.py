@@ -1,7 +1,5 @@
 """Export a leaderboard as the hub's `.eval_results`, Every Eval Ever, and Parquet."""
 
-from __future__ import annotations
-
 import json
 import re
 import uuid

@@ -4,8 +4,6 @@
 is the only file of a release that differs between two builds.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Verify submissions, and rank those with the same items and panel together."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Votes are recast if that needs no key. Items, prompts and media are compared wit
 cannot be checked, among it every column of NOT_RECOMPUTED.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math

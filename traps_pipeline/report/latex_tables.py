@@ -3,8 +3,6 @@
 The Styler of pandas does the same, but takes longer than all other work on a report's tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from traps_pipeline.base.terminal import plain

@@ -3,8 +3,6 @@
 Model ids, epochs and versions are untrusted text: each medium escapes them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Render the report page (docs/report.md): findings, leaderboard, results, gaps."""
 
-from __future__ import annotations
-
 import hashlib
 from base64 import b64encode
 from collections.abc import Mapping, Sequence

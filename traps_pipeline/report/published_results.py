@@ -1,7 +1,5 @@
 """Read the paper's results (`assets/published`) in the same frames as a study's."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Any
 

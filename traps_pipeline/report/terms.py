@@ -1,7 +1,5 @@
 """Share titles, marks and sides between tables, figures and pages."""
 
-from __future__ import annotations
-
 from traps_pipeline.protocol.datasets import ARMS, GRADED, TWO_EVENTS, VARIATIONS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW

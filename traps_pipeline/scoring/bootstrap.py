@@ -5,8 +5,6 @@ scenarios. Every resample is computed twice: with one unseen scenario in each sh
 (its lower end), and with one that is the best (its upper end).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast

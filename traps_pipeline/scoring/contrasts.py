@@ -6,8 +6,6 @@ regimes item by item. Answers to different items, or to one item in different ep
 row gives the reason and no difference.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from math import comb, erfc, inf, sqrt

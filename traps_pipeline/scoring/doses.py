@@ -5,8 +5,6 @@ have. Beside every figure of a model stands the score of shortcut rules, which r
 the score of a guess.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast

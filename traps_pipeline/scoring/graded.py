@@ -5,8 +5,6 @@ nothing. The expected points of an answer follow from the posterior of its cut, 
 the futures was filmed.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence

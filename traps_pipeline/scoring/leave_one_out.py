@@ -1,7 +1,5 @@
 """Compute PECS without one judge (docs/spec.md 4.1, 5.1), to show its influence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

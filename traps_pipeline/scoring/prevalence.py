@@ -1,7 +1,5 @@
 """Count each axis of confabulation in a model's void failures (docs/spec.md 6.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

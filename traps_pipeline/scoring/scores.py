@@ -1,7 +1,5 @@
 """Compute a leaderboard's scores from verdicts, as the scoring stages do in turn."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pandas as pd

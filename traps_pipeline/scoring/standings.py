@@ -1,7 +1,5 @@
 """Average over runs, per dataset and overall, with deviations (docs/spec.md 5.2)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, cast

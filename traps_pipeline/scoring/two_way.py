@@ -4,8 +4,6 @@ Effects are differences of shares, with intervals over scenarios. Arms whose out
 and enter none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, cast
 

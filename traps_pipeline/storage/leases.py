@@ -1,7 +1,5 @@
 """Lease pieces of work that processes share; a lease expires with its process."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager

@@ -1,7 +1,5 @@
 """Append JSON Lines with a checksum per line, to detect damaged lines."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

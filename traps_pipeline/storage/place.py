@@ -1,7 +1,5 @@
 """Locate a study: a folder of this machine, or an address in an object store."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Read measured answer probabilities of graded cuts (docs/arms.md, "Graded cuts")."""
 
-from __future__ import annotations
-
 import json
 
 from traps_pipeline.protocol.datasets import GRADED

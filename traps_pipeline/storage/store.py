@@ -5,8 +5,6 @@ Code names a file by its path below the workspace's folder on this machine, writ
 (`FolderStore`) both do nothing. Only `Workspace.is_shared` tells the two apart, for what several hosts cannot share.
 """
 
-from __future__ import annotations
-
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ Nothing is asked, rendered or extracted again. Until everything is there, the ad
 study; a killed move is repeated. Afterwards the folder is no longer a study, so that nobody pays twice; its files stay.
 """
 
-from __future__ import annotations
-
 import shutil
 from itertools import islice
 from pathlib import Path

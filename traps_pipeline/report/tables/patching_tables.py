@@ -1,7 +1,5 @@
 """Tabulate indirect effects of activation patching, beside their nulls."""
 
-from __future__ import annotations
-
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import LAYER, few_marks, few_note, interval, short_names
 from traps_pipeline.report.tables.table_columns import MODEL
