@@ -230,8 +230,8 @@ def local(params: str = PARAMS, device: str = ", device: cpu", more: str = "") -
     ("text", "named"),
     [
         (local(device=""), ["device: ", "cpu, cuda"]),
-        (local(device=", device: gpu"), ["device: String should match"]),
-        (local(PARAMS.replace(", quantisation: none", "")), ["params: quantisation: Field"]),
+        (local(device=", device: gpu"), ["device: must be of the form"]),
+        (local(PARAMS.replace(", quantisation: none", "")), ["params: quantisation: is missing"]),
         (local(f"{PARAMS}, top_k: 5"), ["params: top_k: "]),
         (local(f"{PARAMS}, temperature: 0.8"), ["params: ", "do_sample: false", "temperature"]),
         (local(PARAMS.replace("false", "true")), ["params: ", "do_sample: true", "temperature", "top_p"]),
