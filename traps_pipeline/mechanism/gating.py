@@ -252,10 +252,5 @@ def _row(
     figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
     row_keys: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
     return GateRow(
-        **states.joined,
-        **row_keys,
-        **nan_to_null(figures),
-        layer=layer,
-        n_controls=sides[0],
-        n_voids=sides[1],
+        **states.joined, **row_keys, **nan_to_null(figures), layer=layer, n_controls=sides[0], n_voids=sides[1]
     )

@@ -215,8 +215,7 @@ class SteeringRow(SteeredCell):
     served_model: Annotated[str | None, "checkpoint, digest and precision that answered"]
     completion_tokens: shared.Tokens
     degenerate: Annotated[
-        str | None,
-        "why the text is no answer: truncated, empty, letters (none), repetition, script; null if it is one",
+        str | None, "why the text is no answer: truncated, empty, letters (none), repetition, script; null if it is one"
     ]
     direction_digest: Annotated[str | None, "digest of the direction's numbers"]
     request_key: Annotated[str, "ledger key; the two datasets of a taxonomy share the key of a control"]

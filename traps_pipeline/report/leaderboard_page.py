@@ -42,15 +42,7 @@ from traps_pipeline.report.terms import (
     TITLES,
     TWO_WAY_MEANINGS,
 )
-from traps_pipeline.report.writing import (
-    NONE,
-    Column,
-    PrintedTable,
-    SourceItems,
-    fraction,
-    table_markdown,
-    table_text,
-)
+from traps_pipeline.report.writing import NONE, Column, PrintedTable, SourceItems, fraction, table_markdown, table_text
 from traps_pipeline.scoring.analyses import null_single_deviations
 from traps_pipeline.scoring.metrics import joined_epochs
 from traps_pipeline.scoring.score_rows import LEADERBOARD

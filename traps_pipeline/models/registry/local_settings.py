@@ -64,8 +64,7 @@ class MechanismSpec(BaseModel):
     quantisation: Quantisation | None = None
     nf4_skip: tuple[str, ...] = ()
     random_weights: bool = Field(
-        default=True,
-        description="also read the network with random weights, twice; false: claims lack it",
+        default=True, description="also read the network with random weights, twice; false: claims lack it"
     )
 
     @model_validator(mode="after")

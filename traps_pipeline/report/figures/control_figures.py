@@ -10,15 +10,7 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.patching_tables import SITES
 from traps_pipeline.report.terms import TITLES
-from traps_pipeline.report.writing import (
-    INK,
-    PAGE_IN,
-    NotRun,
-    figure_style,
-    fraction,
-    new_figure,
-    plain,
-)
+from traps_pipeline.report.writing import INK, PAGE_IN, NotRun, figure_style, fraction, new_figure, plain
 
 if TYPE_CHECKING:
     import pandas as pd

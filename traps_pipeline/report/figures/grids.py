@@ -10,15 +10,7 @@ import numpy as np
 from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.writing import (
-    COLOURS,
-    PAGE_IN,
-    SOFT,
-    NotRun,
-    figure_style,
-    new_figure,
-    plain,
-)
+from traps_pipeline.report.writing import COLOURS, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 from traps_pipeline.scoring import analyses
 
 if TYPE_CHECKING:
