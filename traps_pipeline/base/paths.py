@@ -65,10 +65,7 @@ def require_own_corrections(folder: Path = CORRECTIONS) -> Path:
 
 
 def require_history_path(folder: Path) -> None:
-    """Raise TrapsError if Dagster cannot store its history below a folder.
-
-    Dagster puts the path into a URL, in which `?` begins the parameters and `%41` is an A.
-    """
+    """Raise TrapsError if Dagster, which puts it into a URL, cannot store its history below a folder."""
     if match := _NO_ADDRESS.search(str(folder.absolute())):
         raise TrapsError(
             f"{str(folder)!r}: the path holds {match[0]!r}, below which Dagster cannot keep its history; choose a path "

@@ -41,10 +41,7 @@ class Tally:
 
 @dataclass
 class Traffic:
-    """A stage's calls to one model or judge, with the last 500 latencies in seconds.
-
-    sent_at: when each call in flight was sent, the oldest first.
-    """
+    """A stage's calls to one model or judge, with the last 500 latencies, and when each call in flight was sent, s."""
 
     wanted: int = 0
     cached: int = 0

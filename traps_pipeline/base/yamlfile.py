@@ -276,10 +276,7 @@ def _converted_values(data: Any, validated: Any, name: str = "") -> Iterator[str
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None, also: Sequence[str] = ()) -> str:
-    """Return a validation error as `field: complaint` in our words, with the nearest known field.
-
-    also: names of fields that the model does not have.
-    """
+    """Return a validation error as `field: complaint`, with the nearest field of the model or of `also`."""
     parts = list[str]()
     for details in error.errors():
         place, kind, value = details["loc"], details["type"], details.get("input")

@@ -136,10 +136,7 @@ def _read_all(files: Sequence[Path], damage_of: Callable[[Path], str]) -> str:
 
 
 def examine_unused(place: Place, *, is_removed: bool) -> Finding:
-    """Return a finding on old unreferenced objects, removed or not, in a shared store.
-
-    Raises TrapsError for a study that is not shared.
-    """
+    """Return a finding on old unreferenced objects, removed or not. Raises TrapsError if the study is not shared."""
     from traps_pipeline.storage.store import GRACE_DAYS
     from traps_pipeline.storage.workspace import Workspace
 

@@ -90,10 +90,7 @@ def _studio() -> SyntheticClip:
 
 
 def requests_of(entry: Entry, *, structured: bool = True) -> dict[str, Request]:
-    """Return an entry's test calls by name, stamped with the time so none is reused.
-
-    structured: whether a model is asked for an object of a schema, too.
-    """
+    """Return an entry's new test calls by name. structured: whether a model is asked for an object of a schema, too."""
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -352,10 +349,7 @@ def _outcome(row: Row) -> Outcome:
 
 
 def require_sound(results: Sequence[LiveResult], goes_on: Callable[[str], bool]) -> None:
-    """Raise TrapsError naming all problems of all entries, or what was not checked.
-
-    goes_on: returns whether to run without knowing what a sentence says was not checked.
-    """
+    """Raise TrapsError naming all problems, or what was not checked unless `goes_on` says to run without."""
     messages = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
     advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
     if not messages:

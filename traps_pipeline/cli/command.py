@@ -68,10 +68,7 @@ class LineHelpFormatter(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that suggests the nearest word, and accepts `short` names of commands.
-
-    `commands` maps the name of every command below it, such as `study run`, to its parser.
-    """
+    """A parser that suggests the nearest word. commands: the parser of every command below it, as `study run`."""
 
     def __init__(self, *, short: Mapping[str, str] | None = None, **settings: Any) -> None:
         super().__init__(**settings)
@@ -226,10 +223,7 @@ def add_listening(parser: argparse.ArgumentParser, *, port: int, variable: str) 
 def listening_of(
     arguments: argparse.Namespace, command: str, variable: str, *, danger: str, people: Sequence[str] = ()
 ) -> ServerSettings:
-    """Return address and token (or tokens by person) of a command that serves pages.
-
-    danger: what everybody who reaches the address could do. Raises TrapsError.
-    """
+    """Return a page server's address and tokens. danger: what everybody who reaches it could do. Raises TrapsError."""
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.webguard import personal_tokens, public_name, token_for
     from traps_pipeline.servers.server import ServerSettings

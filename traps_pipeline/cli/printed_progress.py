@@ -39,10 +39,7 @@ def make_progress(form: Form = "auto", stream: TextIO | None = None) -> PrintedP
 
 
 class PrintedProgress(Progress):
-    """Progress as text: a line per stage that made calls, rendered or took long.
-
-    One more line sums up all other stages; the running stage prints a line every 30 s.
-    """
+    """Progress as text: a line per long stage, one for all others, and one every 30 s of the running stage."""
 
     beat_s = HEARTBEAT_S
 

@@ -98,11 +98,7 @@ class Answer(BaseModel):
 
 @dataclass(frozen=True)
 class ImportResult:
-    """The result of an import.
-
-    New answers, answers already in the ledger, failed calls in words, which stay missing, and the number of error
-    messages left out.
-    """
+    """New answers, those already in the ledger, failed calls in words, and how many error messages were left out."""
 
     new: int
     known: int
@@ -263,10 +259,7 @@ def export_request_batches(
 
 
 def export_vote_batches(workspace: Workspace, experiment: Experiment, out: Path) -> tuple[list[Path], int]:
-    """Write the missing votes on the experiment's answers as the judges' batch files.
-
-    Return the files, and the number of calls. Raises TrapsError if answers are missing.
-    """
+    """Write missing votes as batch files; return these and the number of calls. Raises TrapsError without answers."""
     missing: dict[str, list[Request]] = {}
     settled_keys: dict[Evaluation, set[str]] = {}
     for cell, request in _wanted_votes(workspace, experiment):

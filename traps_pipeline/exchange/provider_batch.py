@@ -165,10 +165,7 @@ def is_batch(path: Path) -> bool:
 
 
 def read_batch(path: Path, wanted: Mapping[str, Request]) -> dict[str, BatchResult]:
-    """Return a file's results (OpenAI, vLLM, Gemini or Anthropic) by key.
-
-    Raises TrapsError naming lines that are no results, and unwanted or repeated keys.
-    """
+    """Return a provider's results by key. Raises TrapsError naming wrong, unwanted and repeated lines."""
     answers, problems = dict[str, BatchResult](), list[str]()
     for number, line in read_lines(path):
         try:

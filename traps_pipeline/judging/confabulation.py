@@ -124,10 +124,7 @@ class Labels(BaseModel):
 
 
 def collect_labels(workspace: Workspace) -> StageOutput:
-    """Sample failures, ask for missing labels, and return CONFABULATION rows.
-
-    There are no rows if the study's panel has no judge for confabulation.
-    """
+    """Sample failures, ask for missing labels, and return CONFABULATION rows; none without a judge for them."""
     protocol, table, total = load_protocol(), list[ConfabulationRow](), Tally()
     judge = protocol.judge(workspace.study.panel)
     if judge is None:

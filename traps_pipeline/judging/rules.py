@@ -51,11 +51,7 @@ _QUESTION = re.compile(r"\AQuestion: (.*)$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Statement:
-    """The meaning of a text.
-
-    value: the answer that it commits to; None if it abstains. rejects: whether it denies that something in the question
-    exists.
-    """
+    """A text's meaning: the answer that it commits to (None: it abstains), and whether it rejects the premise."""
 
     value: str | None
     rejects: bool = False

@@ -37,10 +37,7 @@ class CapExhausted:
 
 @dataclass
 class Request:
-    """A call's worst case, to be reserved under the caps of participants and of the study (None).
-
-    exhausted: set by the commit, if a cap leaves no room.
-    """
+    """A call's worst case, to be reserved under the caps of participants and study. exhausted: the full cap, if any."""
 
     id: str
     participant: str
@@ -61,10 +58,7 @@ class Amount(NamedTuple):
 
 
 class Batch:
-    """A transaction of the commit thread: collects changes, which `flush` writes and seals.
-
-    damaged: makes the error about what is no money, or not what was written.
-    """
+    """A transaction of the commit thread: changes that `flush` seals. damaged: makes the error about damage."""
 
     def __init__(
         self, connection: sa.Connection, study: int, session: str, damaged: Callable[[str], TrapsError]
@@ -147,10 +141,7 @@ class Batch:
         return cursor
 
     def is_sealed(self) -> bool:
-        """Return whether the study has a seal.
-
-        Raises TrapsError if money, rows or evaluations are not those of the last transaction.
-        """
+        """Return whether the study has a seal. Raises TrapsError unless all is as the last transaction left it."""
         query, amounts = sa.select(SEALS).where(SEALS.c.study == self.study), self.amounts()
         if (seal := self.connection.execute(query).first()) is None:
             orphans = sa.select(EVALUATIONS.c.study).where(EVALUATIONS.c.study.not_in(sa.select(STUDIES.c.id)))

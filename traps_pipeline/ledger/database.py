@@ -253,10 +253,7 @@ class Database(ABC):
         self._thread.start()
 
     def prepare(self, connection: sa.Connection) -> None:
-        """Create missing tables, and the rows of the study and of this session; verify the rest.
-
-        Raises TrapsError for a ledger that must not be written on.
-        """
+        """Create what is missing, and verify the rest. Raises TrapsError for a ledger that must not be written on."""
         self._check_additions(connection)
         METADATA.create_all(connection)
         self.study = (

@@ -182,10 +182,7 @@ class Ledger:
 
     @asynccontextmanager
     async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = wait_forever) -> AsyncIterator[Writer]:
-        """Become an evaluation's one writer; while another process is, wait and report it.
-
-        Raises LockGivenUp when `give_up` returns true while waiting, and TrapsError.
-        """
+        """Become an evaluation's one writer, or wait. Raises TrapsError, and LockGivenUp if `give_up` says so."""
         with self.database.writing():
             lock = await self._lock(evaluation, waiting, give_up)
             try:
@@ -195,10 +192,7 @@ class Ledger:
                 lock.release()
 
     async def store(self, rows: Mapping[str, Sequence[Stored]], waiting: Waiting) -> int:
-        """Add rows whose keys are not settled, all or none; return how many settle one.
-
-        Holds these evaluations' locks meanwhile. Raises TrapsError.
-        """
+        """Add rows of unsettled keys under a lock, all or none; return how many settle one. Raises TrapsError."""
         async with AsyncExitStack() as stack:
             writers = {name: await stack.enter_async_context(self.writing(name, waiting)) for name in sorted(rows)}
             new = list[tuple[Writer, Mapping[str, Any], dict[str, Any]]]()

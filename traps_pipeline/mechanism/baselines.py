@@ -82,10 +82,7 @@ class IdentityScorer:
 
 
 def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
-    """Return the protocol's rows on features in the place of states.
-
-    Those of nearest centroids are included. fit: another probe than the protocol's.
-    """
+    """Return the protocol's rows, nearest centroids too, on features in the place of states. fit: another probe."""
     on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
     return on.comparable_rows(0) + on.centroids(0)
 
@@ -159,10 +156,7 @@ class NoMargin(TrapsError):
 
 
 def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, list[int]]:
-    """Return the model whose head reads stored states, and its abstention tokens.
-
-    Raises NoMargin for states that are means over tokens, and for a model without such a token.
-    """
+    """Return the model whose head reads stored states, and its abstention tokens. Raises NoMargin without either."""
     from traps_pipeline.mechanism.margin import abstention_tokens
     from traps_pipeline.models.local.adapter import load_local_model
 

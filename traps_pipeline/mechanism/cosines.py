@@ -51,10 +51,7 @@ def cross_product(first: PairDifferences, second: PairDifferences, weights: np.n
 
 
 def disattenuated(first: PairDifferences, second: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return cosines of two mean differences, corrected for their noise, (draws,).
-
-    A cosine may exceed 1, and is NaN if a mean difference is not longer than its noise.
-    """
+    """Return cosines corrected for noise, (draws,): above 1 at times, NaN for differences not longer than noise."""
     lengths = cross_product(first, first, weights) * cross_product(second, second, weights)
     is_defined = (lengths > 0) & (cross_product(first, first, weights) > 0)
     return np.where(

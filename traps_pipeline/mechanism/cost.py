@@ -73,10 +73,7 @@ class Cost:
 
 
 def too_large(costs: Sequence[Cost], card: Card, quantised: Collection[str]) -> list[str]:
-    """Return a sentence for each model and work that needs more memory than a card has: what to change.
-
-    quantised: the models that are looked into in NF4.
-    """
+    """Return what to change for each work that needs more memory than a card has. quantised: models in NF4."""
     sentences = list[str]()
     for cost in costs:
         if cost.gigabytes is None or cost.gigabytes <= card.gigabytes:

@@ -166,10 +166,7 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 
 
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
-    """Return saved directions and the content of their JSON file.
-
-    Raises TrapsError if a file is missing, or if its digest differs from the one in the JSON file.
-    """
+    """Return saved directions and the content of their JSON file. Raises TrapsError if one is missing or altered."""
     require("local")
     from safetensors import SafetensorError
     from safetensors.numpy import load_file

@@ -54,10 +54,7 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return REGIME_COLUMNS: mean abstention of path sets at alpha 0 and the largest.
-
-    It is by direction regime, inference regime and kind of direction; family `all`.
-    """
+    """Return REGIME_COLUMNS: mean abstention of path sets at alpha 0 and the largest, by regimes and kind."""
     return _regime_rows(effects, lambda source: "all")
 
 
@@ -107,10 +104,7 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return mean control abstention by layer and alpha, along own directions.
-
-    Columns CELL, layer, alpha, control, n_splits. Empty if only one layer was steered.
-    """
+    """Return mean control abstention by layer and alpha, along own directions; empty for one steered layer."""
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
     rows = rows.loc[rows["source"] == rows["target"]]
     groups = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
@@ -120,10 +114,7 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
-    """Return effects with `gaps`, their strength in class gaps of their own dataset.
-
-    The gap is inferred from the doses in that unit among `every` effect; NaN without any.
-    """
+    """Return effects with `gaps`, their strength in class gaps, inferred from doses in that unit; NaN without any."""
     keys = ["model", "directions", "source", "layer"]
     length = every.loc[(every["unit"] == "gap") & (every["dose"] > 0) & (every["kind"] == "void")]
     length = length.assign(length=length["alpha"] / length["dose"])[[*keys, "length"]].drop_duplicates(keys)

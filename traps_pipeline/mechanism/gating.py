@@ -63,10 +63,7 @@ DecisionsByTarget = Mapping[str, tuple[Decisions, int]]  # target -> decisions a
 
 
 def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[GateRow]:
-    """Return GATE rows of an extraction, for each regime evaluated in run 1.
-
-    Raises TrapsError if the model has no verdicts yet.
-    """
+    """Return GATE rows of an extraction, for each regime of run 1. Raises TrapsError without verdicts."""
     settings, rows = workspace.mechanism, list[GateRow]()
     outcomes = {
         regime: regime_outcomes

@@ -44,10 +44,7 @@ class LayerChoice:
 
 
 def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
-    """Return AUROC by layer and ordered pair (or dataset itself), from PROBES rows.
-
-    Pairs of one taxonomy are scored without the scored scenario in the fit.
-    """
+    """Return AUROC by layer and ordered pair, from PROBES rows; within a taxonomy the held-out ones."""
     curves: dict[tuple[str, str], dict[int, float]] = {}
     for row in rows:
         pair, value = (str(row["source"]), str(row["target"])), row["value"]

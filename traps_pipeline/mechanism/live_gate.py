@@ -29,10 +29,7 @@ Threshold = Literal["mid", "J", "conformal"]
 
 @dataclass(frozen=True, eq=False)
 class Gate:
-    """A probe of a layer's states, whose score above the threshold means abstain.
-
-    pooling: the pooling of the states that it was fitted on.
-    """
+    """A probe of a layer's states of this pooling, whose score above the threshold means abstain."""
 
     layer: int
     probe: Scorer

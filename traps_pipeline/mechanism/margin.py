@@ -60,10 +60,7 @@ def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) 
 
 
 def first_token_margins(model: LocalModel, normed: Any, tokens: Sequence[int]) -> Tensor:
-    """Return margins (n,) of normed states (n, d) at a prompt's end, on the CPU.
-
-    Gradients pass: `patching_effects.attributed_changes` needs them.
-    """
+    """Return margins (n,) of normed states (n, d) at a prompt's end, on the CPU; gradients pass."""
     import torch
 
     states = torch.as_tensor(np.asarray(normed)) if not torch.is_tensor(normed) else normed

@@ -85,10 +85,7 @@ def nan_to_null(figures: Mapping[str, float]) -> dict[str, Any]:
 
 
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
-    """Return STEERING_PECS: void paths with both sides, by dose and sign policy.
-
-    Figures without a decided answer are null.
-    """
+    """Return STEERING_PECS of void paths with both sides, by dose and signs; null without a decided answer."""
     keys = [*_CELL, "source", "target", "layer", "unit", "dose", "signs"]
     rows: list[SteeringPecsRow] = []
     for key, group in effects.loc[effects["kind"] == VOID].groupby(keys, sort=True):

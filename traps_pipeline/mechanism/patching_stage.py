@@ -111,10 +111,7 @@ class Pairs:
         self._folder = workspace.root / "patching" / extraction.model / extraction.prompt / dataset
 
     def changes(self) -> tuple[list[Row], list[Row]]:
-        """Return estimated effects of all patches, and measured ones of `best_cells`.
-
-        Nulls are measured, too. There is a row for each pair, direction, source and cell.
-        """
+        """Return estimated effects of all patches, and measured ones of `best_cells` and nulls, a row for each pair."""
         paths = set[Path]()
         estimates = self._pair_rows("estimates", self._estimates, paths)
         best = best_cells(estimates, self._settings, self._model.n_layers)
@@ -290,10 +287,7 @@ def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: i
 def summarize_effects(
     estimates: Sequence[Row], patches: Sequence[Row], extraction: Extraction, dataset: str, seed: int
 ) -> Iterator[PatchingRow]:
-    """Yield a dataset's rows: ratios of sums over pairs, with intervals if measured.
-
-    If all pairs were left out, a row without an effect says so.
-    """
+    """Yield a dataset's rows: ratios of sums over pairs, with intervals if measured; no effect without a pair."""
     n_left_out = Counter((row["into"], row["source"]) for row in (*estimates, *patches) if "left_out" in row)
     cells = [defaultdict[tuple[Any, ...], list[Row]](list), defaultdict[tuple[Any, ...], list[Row]](list)]
     for rows_by_cell, rows in zip(cells, (estimates, patches), strict=True):

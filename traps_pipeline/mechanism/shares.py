@@ -46,10 +46,7 @@ def paper_protocol_rows(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame, fluency: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return answers with verdicts, one row per path; alpha 0 belongs to every path.
-
-    fluency: rows of STEERING_FLUENCY; column `nats` is null without them.
-    """
+    """Return answers with verdicts (and `nats` by `fluency`), one row per path; alpha 0 belongs to every path."""
     columns = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
     judged_answers = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *columns]]), votes)
     keys = [*_CELL, "item_id", "request_key"]

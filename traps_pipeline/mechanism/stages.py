@@ -51,10 +51,7 @@ if TYPE_CHECKING:
 
 
 def examined_model(workspace: Workspace, model: str) -> ModelEntry:
-    """Return a model's entry with the media settings of the `mechanism` section.
-
-    Raises TrapsError if it is not local, or not in the section.
-    """
+    """Return a local model's entry with the media of the `mechanism` section. Raises TrapsError for another one."""
     entry, settings = get_model(model), workspace.mechanism
     if entry.backend != LOCAL:
         local = ", ".join(name for name in settings.models if get_model(name).backend == LOCAL) or "none of the study's"
@@ -114,10 +111,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
 
 
 def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], system: str) -> Item:
-    """Return the item of a row of PROBE_ITEMS, as the study pools its states.
-
-    Raises TrapsError if a pooling compares the clips of a pair and the scenario lacks one.
-    """
+    """Return the item of a row, as the study pools its states. Raises TrapsError if a pooling lacks the other clip."""
     from traps_pipeline.mechanism.hidden_states import clip_item
     from traps_pipeline.models.local.capture import OF_PAIRS
 
@@ -186,10 +180,7 @@ def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> l
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
-    """Return the scenarios on whose void the model confabulated, by dataset.
-
-    It did so under standard in run 1. A dataset without any has the reason instead.
-    """
+    """Return scenarios whose void the model answered under standard in run 1, by dataset, or why there are none."""
     scenarios: dict[str, frozenset[str]] = {}
     problems: dict[str, str] = {}
     for dataset in DATASETS:
@@ -230,10 +221,7 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
 def direction_pairs(
     settings: MechanismSettings, dataset: str, items: pd.DataFrame
 ) -> tuple[list[str], list[int], list[int]]:
-    """Return a direction's scenarios, and the rows of their voids and controls.
-
-    Raises TrapsError for a study without steering.
-    """
+    """Return a direction's scenarios, and the rows of their voids and controls. Raises TrapsError without steering."""
     steering = settings.steering
     if steering is None:
         raise TrapsError(

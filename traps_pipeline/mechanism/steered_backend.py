@@ -36,10 +36,7 @@ class SteeredBackend(LocalBackend):
         return self.generate(batch.requests, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
-        """Answer requests in groups by layer, unsteered ones apart.
-
-        stopped: called at every token, ends generation early.
-        """
+        """Answer requests in groups by layer, unsteered ones apart. stopped: called at every token, ends them early."""
         from traps_pipeline.mechanism.hook import Steering
 
         groups: dict[int | None, list[int]] = {}

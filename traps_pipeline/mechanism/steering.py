@@ -167,10 +167,7 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, Counter[str]]:
-    """Return the number of steered answers by inference regime and side.
-
-    An answer that cells share counts once. scenarios: their number by taxonomy.
-    """
+    """Return how many steered answers, each once, there are by inference regime and side, of these scenarios."""
     steering = settings.steering
     if steering is None:
         return {}

@@ -80,10 +80,7 @@ def corrected(
 
 
 def rogan_gladen(share: np.ndarray, sensitivity: np.ndarray, specificity: np.ndarray) -> np.ndarray:
-    """Return the Rogan-Gladen estimate of the true share, clipped to [0, 1].
-
-    NaN if sensitivity + specificity is 1 or less: then the judged share carries no information.
-    """
+    """Return the Rogan-Gladen estimate of the true share in [0, 1]; NaN if sensitivity + specificity is 1 or less."""
     gain = sensitivity + specificity - 1
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.clip(np.where(gain > 1e-12, (share + specificity - 1) / gain, np.nan), 0.0, 1.0)

@@ -191,10 +191,7 @@ def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
 
 
 def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
-    """Return the majority of people about each unit of ABOUT_ANSWERS.
-
-    One row per unit, in the columns of HUMAN_LABELS and `truth` (null if as many say yes as no).
-    """
+    """Return the majority about each unit of ABOUT_ANSWERS in columns of HUMAN_LABELS, with `truth` (null: a tie)."""
     if task not in ABOUT_ANSWERS:
         raise ValueError(f"{task}: the panel decides nothing of the kind")
     task_labels = labels.loc[labels["task"] == task]

@@ -34,10 +34,7 @@ GROUPS = tuple(group for groups in JOB_GROUPS.values() for group in groups)
 
 @dataclass(frozen=True)
 class Check:
-    """A check of each partition; `blocks`: a failure blocks everything downstream.
-
-    wrong: returns the failure, or empty.
-    """
+    """A check of each partition; `blocks`: a failure blocks what is below. wrong: returns the failure, or empty."""
 
     name: str
     doc: str

@@ -70,10 +70,7 @@ def visible_metadata(value: Any) -> Any:
 
 
 def tally_metadata(stage: Stage, tally: Tally) -> dict[str, int]:
-    """Return a run's work on a partition, one number per entry for Dagster's plots.
-
-    Zeros are left out where a stage never does such work.
-    """
+    """Return a run's work on a partition as numbers for Dagster's plots, without zeros of what never happens."""
     paid_counts = {"asked", "cached", "errors"} if stage.cost else set()
     return {WORDS[name]: count for name, count in vars(tally).items() if count or name in paid_counts}
 
@@ -84,10 +81,7 @@ def tally_of(metadata: Mapping[str, dg.MetadataValue]) -> Tally:
 
 
 def partition_metadata(workspace: Workspace, stage: Stage, key: str | None, output: StageOutput) -> dict[str, Any]:
-    """Return the metadata that Dagster shows of a partition or of files for people.
-
-    Paths are relative to the study, so that they hold in a copy of it.
-    """
+    """Return what Dagster shows of a partition or of files for people; paths are relative to the study."""
     counts = tally_metadata(stage, output.tally)
     if stage.table is None:
         files = cast(Mapping[str, bytes], output.content)
@@ -99,10 +93,7 @@ def partition_metadata(workspace: Workspace, stage: Stage, key: str | None, outp
 
 
 def preview(table: Table, output: StageOutput) -> dict[str, dg.TableMetadataValue]:
-    """Return a preview: best and worst rows of a ranked table, else the first rows.
-
-    Columns that do not differ and long texts are left out, but for the beginnings of answers.
-    """
+    """Return first rows, or best and worst of a ranked table, without long texts and columns that do not differ."""
     import pandas as pd
 
     content = cast(Any, output.content)

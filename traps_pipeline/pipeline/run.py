@@ -111,10 +111,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def materialize_stale(instance: dg.DagsterInstance, runs: Runs, plan: RunPlan) -> RunReport:
-    """Materialize what a plan finds missing or stale; its problems include failed checks of earlier runs.
-
-    KeyboardInterrupt propagates.
-    """
+    """Materialize what is missing or stale; problems include earlier failed checks. KeyboardInterrupt propagates."""
     report, started_at, history = RunReport(), time.monotonic(), History(instance, plan.graph)
     tags = {MAKE_TAG: STALE_OR_MISSING} | ({EXPERIMENT_TAG: plan.experiment} if plan.experiment else {})
     with remembering_stops():

@@ -31,10 +31,7 @@ Recorded = Callable[[str], Mapping[str | None, str | None]]  # a stage's version
 
 @dataclass(frozen=True)
 class StageStatus:
-    """A stage's partitions: fresh (their number), stale (with reasons), missing.
-
-    A stage without partitions has one, of its own name.
-    """
+    """A stage's partitions (or itself, by its name): fresh (their number), stale (with reasons), missing."""
 
     stage: str
     fresh: int
@@ -47,10 +44,7 @@ class StageStatus:
         return len(self.stale) + len(self.missing)
 
     def by_reason(self) -> Mapping[str, list[str]]:
-        """Return the partitions that are not fresh, by their reasons.
-
-        A reason leaves out the partition's own key, so that many partitions share it.
-        """
+        """Return the partitions that are not fresh, by their reasons without the partition's own key."""
         groups = dict[str, list[str]]()
         for key, reasons in self.stale.items():
             general_reasons = [reason.replace(f"/{key} ", " ") for reason in reasons]
@@ -217,10 +211,7 @@ class RunPlan:
 
 
 def stages_until(until: str | None) -> set[str] | None:
-    """Return the stages of `until` (comma-separated) and their upstream; None for all.
-
-    Raises TrapsError for an unknown stage.
-    """
+    """Return the stages of `until` (comma-separated) and their upstream; None for all. Raises TrapsError."""
     if until is None:
         return None
     graph = the_graph()

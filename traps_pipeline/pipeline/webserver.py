@@ -40,10 +40,7 @@ SERVED_FOLDERS = ("reports", "site", "clips")
 
 
 def serve_with_dagster(host: str, port: int, token: str) -> NoReturn:
-    """Run web server, daemon, code server until KeyboardInterrupt, then stop them all.
-
-    Raises TrapsError if one of them ends by itself.
-    """
+    """Run web server, daemon and code server until KeyboardInterrupt; raise TrapsError if one of them ends."""
     with tempfile.TemporaryDirectory() as folder:
         address, workspace = f"{folder}/code.sock", Path(folder) / "workspace.yaml"
         location = {"grpc_server": {"socket": address, "location_name": _MODULE}}

@@ -39,10 +39,7 @@ class Question(Call):
 
 
 def answer_request(workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], evaluation: Evaluation) -> Request:
-    """Return the call about an item: frames or video, then the question, nothing else.
-
-    The clip's media are prepared here if they are missing; every regime and run then shares them.
-    """
+    """Return the call about an item; its media are prepared if missing, for every regime and run."""
     clip, dataset = workspace.resolve(item["clip"]), dataset_of(item["item_id"])
     spec = media_for_dataset(entry.media, dataset) if entry.media else None
     media = workspace.media.prepare(clip, item["media_digest"], spec) if spec else None

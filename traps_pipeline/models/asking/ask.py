@@ -133,10 +133,7 @@ def _by_evaluation(cells: Sequence[AnyCell]) -> list[tuple[Evaluation, list[AnyC
 
 @dataclass
 class _Asking:
-    """Workers over the missing requests of one evaluation.
-
-    again: what to record of a call that is repeated to tell refusals from failures; nothing stops its model.
-    """
+    """Workers over an evaluation's missing requests. again: what to record of a call that is repeated to settle it."""
 
     work: Work[Any, Any, Any]
     writer: Writer

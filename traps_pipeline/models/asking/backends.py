@@ -22,10 +22,7 @@ def require_libraries(entry: Entry) -> None:
 
 
 def make_backend(entry: Entry) -> Backend:
-    """Return the entry's backend, and import its library only now.
-
-    Raises TrapsError if its library is not installed, its key is not set, or its weights are missing.
-    """
+    """Return the entry's backend. Raises TrapsError if its library, its key or its weights are missing."""
     require_libraries(entry)
     match entry.backend:
         case "reference":

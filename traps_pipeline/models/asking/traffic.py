@@ -90,10 +90,7 @@ class RateLimiter:
         return float("inf") if rate is None else max(rate * BURST_S, least)
 
     async def admit(self, tokens: int, halted: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a call with this many tokens may be sent, or calls are halted.
-
-        The bucket may go below zero: later calls wait longer.
-        """
+        """Wait until a call with these tokens may be sent, or calls are halted; later calls wait longer for it."""
         send_at = time.monotonic() + self._take((1.0, float(tokens)))
         while (wait_s := send_at - time.monotonic()) > 0 and not halted():
             await asyncio.sleep(min(wait_s, LOOK_S))
@@ -145,10 +142,7 @@ class CircuitBreaker:
                 raise ParticipantStopped(stops[self._participant])
 
     def no_connection(self, why: str = "") -> None:
-        """Raise ParticipantStopped after five unsent calls in a row, over some time.
-
-        A restarted server has that long. why: why the last one was not sent.
-        """
+        """Raise ParticipantStopped, with the reason, after five unsent calls in a row over some time."""
         self._unmade += 1
         self._unmade_since = self._unmade_since or time.monotonic()
         if self._unmade >= UNMADE_IN_A_ROW and time.monotonic() - self._unmade_since >= UNMADE_S:

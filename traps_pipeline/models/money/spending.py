@@ -68,10 +68,7 @@ def releasable(workspace: Workspace) -> dict[str, Releasable]:
 
 
 def release_money(workspace: Workspace, participant: str, usd: float | None, why: str) -> float:
-    """Release a participant's dollars (None: all in flight); return the amount.
-
-    Raises TrapsError if less is reserved for calls that may never have been sent.
-    """
+    """Release a participant's dollars (None: all in flight); return the amount. Raises TrapsError if less is held."""
     with workspace.ledger.writing():
         money = Money(workspace.ledger)
         account = account_budgets(workspace, money.spent()).get(participant)

@@ -186,10 +186,7 @@ def panel_advice(path: Path = JUDGES_FILE) -> str:
 
 
 def require_panel(panel: str, models: Iterable[str], *, judged_by_rules: bool) -> None:
-    """Raise TrapsError unless the panel is named, known, and allowed for these models.
-
-    Rules judge models other than reference strategies only if the user says so.
-    """
+    """Raise TrapsError unless the panel is known, and allowed for these models (rules: if the user says so)."""
     load_panel(panel)
     other_models = [model for model in models if not is_reference(model)]
     if is_of_rules(panel) and other_models and not judged_by_rules:

@@ -274,10 +274,7 @@ class ApiBackend:
         return f"HTTP {exchange.status}, {kind}, {len(exchange.content or b'')} bytes{quotation}"
 
     def _tell(self, kind: str, message: str, *, passes: bool | None = None) -> None:
-        """Report a message once per kind, without the key, and whether a run retries.
-
-        passes: whether a retry may help; None if the call has a result.
-        """
+        """Report a message once per kind, without the key, and whether a retry may help (None: no need)."""
         if kind not in self._told:
             self._told.add(kind)
             message = redact(" ".join(message.split())).removeprefix(f"{kind}: ")  # before it is cut

@@ -42,11 +42,7 @@ class OddShapeError(ValueError):
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer as its provider sent it.
-
-    finish: the raw finish reason; usage: the raw counts; first_token: log-probabilities of alternatives for its first
-    token, if it gives any.
-    """
+    """An answer as its provider sent it: text, raw finish reason and counts, and log-probabilities of first tokens."""
 
     text: str
     reasoning: str

@@ -74,10 +74,7 @@ class LenientHandler(ResponseHandler):
 
 
 def rewrite_head(head: bytes) -> tuple[bytes, int | None]:
-    """Return a head that the parser accepts, and the length of the body if the head gives it.
-
-    A head that no client reads is returned as it is.
-    """
+    """Return a head that the parser accepts, if any client reads it, and the body's length if the head gives it."""
     lines = re.split(rb"\r?\n", re.sub(rb"\r?\n[ \t]+", b" ", head.rstrip(b"\r\n")))
     status = _STATUS.match(lines[0])
     if status is None:

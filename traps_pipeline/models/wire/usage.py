@@ -62,10 +62,7 @@ class Sizes:
 
 
 def read_usage(fields: Mapping[str, Any], sizes: Sizes) -> Usage | None:
-    """Return the usage in an answer's counts; None if they contain none.
-
-    It is not believed if it is incomplete, impossible, or below our own count for prompt and text.
-    """
+    """Return the usage in an answer's counts, not believed below our own count; None if they contain none."""
     for (prompt, completion, total), extra_fields in _FORMS:
         if prompt in fields:
             usage = _complete_usage(fields, prompt, completion, total, extra_fields)

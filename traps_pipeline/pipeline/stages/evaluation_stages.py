@@ -85,9 +85,7 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
     side_by_side=True,
 )
 def responses(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | None, StageOutput]]:
-    """Return a model's answers under a regime in a run, one row per item.
-
-    Answers in the ledger are reused."""
+    """Return a model's answers under a regime in a run, one row per item. Answers in the ledger are reused."""
     from traps_pipeline.models.asking.answers import collect_answers
 
     return _with_items(workspace, collect_answers(workspace, [Cell.parse(key) for key in keys]))
