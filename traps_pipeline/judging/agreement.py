@@ -74,7 +74,8 @@ def fleiss_kappa(values: np.ndarray) -> float:
     if k < 2 or total in (0, n * k):
         return float("nan")
     observed_agreement = float(np.mean(yes * (yes - 1) + (k - yes) * (k - yes - 1))) / (k * (k - 1))
-    return _chance_corrected(observed_agreement, _chance_agreement(total / (n * k)))
+    p = total / (n * k)
+    return _chance_corrected(observed_agreement, p * p + (1 - p) * (1 - p))
 
 
 def cohen_kappa(first: np.ndarray, second: np.ndarray) -> float:
@@ -110,10 +111,6 @@ def unanimous_share(values: np.ndarray) -> float:
     """Return the share of unanimous rows (answers, judges); NaN if empty or one judge."""
     has_several_judges = len(values) and values.shape[1] > 1
     return float(np.mean((values == values[:, :1]).all(axis=1))) if has_several_judges else float("nan")
-
-
-def _chance_agreement(p: float) -> float:
-    return p * p + (1 - p) * (1 - p)
 
 
 def _chance_corrected(observed: float, by_chance: float) -> float:

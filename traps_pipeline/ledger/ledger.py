@@ -42,11 +42,6 @@ Waiting = Callable[[str], None]  # called once with the holder of the lock
 GiveUp = Callable[[], bool]  # returns whether to stop waiting
 
 
-def wait_forever() -> bool:
-    """Return False: wait without end."""
-    return False
-
-
 class LockGivenUp(Exception):
     """Waiting for a lock was cancelled."""
 
@@ -181,7 +176,9 @@ class Ledger:
     # --- writing ------------------------------------------------------------------------------------------------------
 
     @asynccontextmanager
-    async def writing(self, evaluation: str, waiting: Waiting, give_up: GiveUp = wait_forever) -> AsyncIterator[Writer]:
+    async def writing(
+        self, evaluation: str, waiting: Waiting, give_up: GiveUp = lambda: False
+    ) -> AsyncIterator[Writer]:
         """Become an evaluation's one writer, or wait. Raises TrapsError, and LockGivenUp if `give_up` says so."""
         with self.database.writing():
             lock = await self._lock(evaluation, waiting, give_up)

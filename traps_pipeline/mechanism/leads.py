@@ -84,12 +84,12 @@ def stacked(table: pd.DataFrame, features: Features) -> np.ndarray:
     return gate_items(table, features, shuffled=False, seed=0).features
 
 
-def nuisance_components(blocks: Sequence[np.ndarray], most: int = COMPONENTS) -> np.ndarray:
+def nuisance_components(blocks: Sequence[np.ndarray]) -> np.ndarray:
     """Return the leading principal components (n, k) of blocks (n, d) of equal total variance."""
     centred = [block - block.mean(axis=0) for block in blocks]
     gram = np.sum([part @ part.T / max(float((part**2).sum()), 1e-12) for part in centred], axis=0)
     values, vectors = np.linalg.eigh(gram)
-    return vectors[:, ::-1][:, : min(most, len(gram) // 4, int((values > 1e-9 * values[-1]).sum()))]
+    return vectors[:, ::-1][:, : min(COMPONENTS, len(gram) // 4, int((values > 1e-9 * values[-1]).sum()))]
 
 
 def residual(states: np.ndarray, components: np.ndarray) -> np.ndarray:

@@ -151,8 +151,7 @@ class Pairs:
         for patched_side, target, _, groups in self._directions(name):
             if groups is None:
                 continue
-            cells: list[tuple[Site, int, str]]
-            cells = [
+            cells: list[tuple[Site, int, str]] = [
                 (site, layer, group)
                 for side, site, layer, group in best
                 if side == patched_side and groups[group].any()
@@ -167,15 +166,8 @@ class Pairs:
                 margin, changes = self._patch(target_pass, side, patches)
                 source_margin = margin if kind == OWN else source_margin
                 for cell, patch, change in zip(cells, patches, changes, strict=True):
-                    yield _row(
-                        name,
-                        patched_side,
-                        kind,
-                        cell,
-                        patch.positions,
-                        (target_pass.margin, source_margin),
-                        float(change),
-                    )
+                    ends = target_pass.margin, source_margin
+                    yield _row(name, patched_side, kind, cell, patch.positions, ends, float(change))
             del target_pass  # before the other side's pass is recorded
 
     def _attribute(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
@@ -305,11 +297,9 @@ def summarize_effects(
         )
         gap = float((target - source_outcome).sum()) if len(rows) else 0.0
         estimated_change = sum(row["change"] for row in estimated.get(key, ()))
-        effect = (
-            effect_of(source_outcome, source_outcome + change, target, seed)
-            if key in measured_rows
-            else (None, None, None)
-        )
+        effect: tuple[float | None, ...] = (None, None, None)
+        if key in measured_rows:
+            effect = effect_of(source_outcome, source_outcome + change, target, seed)
         is_different = np.sign(source_outcome) != np.sign(target)
         is_flipped = (np.sign(source_outcome + change) != np.sign(source_outcome)) & is_different
         yield PatchingRow(

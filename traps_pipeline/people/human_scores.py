@@ -45,12 +45,9 @@ def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
     resampling = draw_scenarios(items, resamples, seed)
     means = means_over_runs(run_sums(items, resampling, "people"), figures_of, resamples + 1)
-    rows = [_row(dataset, figures, _dataset_clips(clips, dataset)) for dataset, figures in means.items()]
+    clips_of = {name: clips if name == "overall" else clips.loc[clips["dataset"] == name] for name in means}
+    rows = [_row(dataset, figures, clips_of[dataset]) for dataset, figures in means.items()]
     return pd.DataFrame(rows, columns=pd.Index(HUMAN_ROW.names))
-
-
-def _dataset_clips(clips: pd.DataFrame, dataset: str) -> pd.DataFrame:
-    return clips if dataset == "overall" else clips.loc[clips["dataset"] == dataset]
 
 
 def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, Any]:

@@ -79,10 +79,6 @@ class RunResources:
     each_gb: float = 0.0
 
 
-def _no_work(_: Workspace, __: Any, ___: bool) -> tuple[Tally, bool]:
-    return Tally(), True
-
-
 @dataclass(frozen=True)
 class ConcurrentBuild:
     """How several runs build one partition: its files together, then one builds it.
@@ -92,7 +88,7 @@ class ConcurrentBuild:
     the missing files, as far as that is known before anything upstream exists.
     """
 
-    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = _no_work
+    files: Callable[[Workspace, Any, bool], tuple[Tally, bool]] = lambda _, __, ___: (Tally(), True)
     seconds: Callable[[Workspace, Any], float] = lambda workspace, key: 0.0
 
 

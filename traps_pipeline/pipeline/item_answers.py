@@ -42,7 +42,8 @@ def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
                 evaluation = Evaluation(model, regime, run)
                 if evaluation.key not in rows_by_evaluation:
                     continue
-                rows = [row for row in rows_by_evaluation[evaluation.key].rows.values() if _item_id_of(row) == item_id]
+                all_rows = rows_by_evaluation[evaluation.key].rows.values()
+                rows = [row for row in all_rows if row["components"]["about"]["item_id"] == item_id]
                 if not rows:
                     continue
                 request = answer_request(workspace, entry, current, evaluation) if current else None
@@ -102,10 +103,6 @@ def _rows_about(
     data = workspace.tables.read_arrow(table, columns, **partition)
     places = [place for place, name in enumerate(data["item_id"].to_pylist()) if name == item_id]
     return [row for place in places for row in data.slice(place, 1).to_pylist()]
-
-
-def _item_id_of(row: Mapping[str, Any]) -> Any:
-    return row["components"]["about"]["item_id"]
 
 
 def _current_item(workspace: Workspace, dataset: str, item_id: str) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ from typing import Generic, Literal, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.pipeline.graph import Graph, Stage, name_of, the_graph
+from traps_pipeline.pipeline.graph import Stage, name_of, the_graph
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.storage.parquet import State
 from traps_pipeline.storage.workspace import Workspace
@@ -66,8 +66,8 @@ class _Once(Generic[Value]):
 class Lineage:
     """A snapshot of a workspace that looks each version up once. thorough: read every table in full."""
 
-    def __init__(self, workspace: Workspace, graph: Graph | None = None, *, thorough: bool = False) -> None:
-        self._workspace, self.graph, self._thorough = workspace, graph or the_graph(), thorough
+    def __init__(self, workspace: Workspace, *, thorough: bool = False) -> None:
+        self._workspace, self.graph, self._thorough = workspace, the_graph(), thorough
         workspace.store.look()
         self.version, self.state, self.damage = _Once(self._version), _Once(self._state), _Once(self._damage)
         self.status, self._there = _Once(self._status), _Once(lambda name, _: self._keys_there(name))

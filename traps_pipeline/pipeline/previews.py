@@ -44,12 +44,12 @@ class StudyFile:
         return f"{STUDY_URL}/{quote(self.path)}" + (f"#{self.view}" if self.view else "")
 
 
-def rows_shown(frame: pd.DataFrame, rows: int = 60) -> Markdown | str:
+def rows_shown(frame: pd.DataFrame) -> Markdown | str:
     """Return the first rows as Markdown; never use it for text that a model wrote."""
     if frame.empty:
         return "not run"
     lines = [[*map(str, frame.columns)], ["---"] * len(frame.columns)]
-    lines += [[_plain(value) for value in row] for row in frame.head(rows).itertuples(index=False)]
+    lines += [[_plain(value) for value in row] for row in frame.head(60).itertuples(index=False)]
     return Markdown("\n".join("| " + " | ".join(line) + " |" for line in lines))
 
 

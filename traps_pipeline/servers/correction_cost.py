@@ -80,7 +80,8 @@ def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction:
                 cost.votes += evaluations * seats * (len(tasks_for(side)) if is_asked_again else 1)
             if is_asked_again:
                 cost.answers += evaluations
-                cost.dollars = _sum_or_none(cost.dollars, _dollars(model, evaluations))
+                dollars = _dollars(model, evaluations)
+                cost.dollars = None if cost.dollars is None or dollars is None else cost.dollars + dollars
     return cost
 
 
@@ -104,7 +105,3 @@ def _dollars(model: str, calls: int) -> float | None:
         return 0.0
     dollars = forecast(entry, calls, Experience()).dollars
     return None if dollars is None else dollars[1]
-
-
-def _sum_or_none(left: float | None, right: float | None) -> float | None:
-    return None if left is None or right is None else left + right

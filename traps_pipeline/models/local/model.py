@@ -88,7 +88,7 @@ class LocalModel:
         placeholders = [getattr(self.processor, f"{kind}_token_id", None) for kind in ("image", "video", "audio")]
         return load_transformers().GenerationConfig(
             eos_token_id=eos,
-            pad_token_id=pad if pad is not None else _first_token(eos),
+            pad_token_id=pad if pad is not None else eos if isinstance(eos, int) else eos[0],
             bos_token_id=config.bos_token_id,
             suppress_tokens=sorted({*(config.suppress_tokens or ()), *filter(None, placeholders)}) or None,
             do_sample=False,
@@ -205,16 +205,12 @@ class LocalModel:
 
         mask = None if chosen is None else torch.from_numpy(chosen)
         if pooling == "answer":
-            prompt = self._with_first_token(prompt, steering)
+            prompt = prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
         with steering_context(steering, self), capture_states(iter(self.blocks), self.norm, pooling, mask) as states:
             self.forward(prompt)
         assert states.normed is not None and len(states.raw) == self.n_layers + 1
         rows = torch.stack([row.float().cpu() for row in (*states.raw, states.normed)]).numpy()
         return States(rows[:-1], rows[-1])
-
-    def _with_first_token(self, prompt: Prompt, steering: Steers | None) -> Prompt:
-        """Return the prompt followed by the first token of its greedy answer."""
-        return prompt.followed_by(self.generate([prompt], 1, steering=steering)[0].tokens)
 
     # --- answers ------------------------------------------------------------------------------------------------------
 
@@ -322,10 +318,6 @@ def shown_frames(marks: Sequence[int]) -> int:
     """
     step = (marks[-1] - marks[0]) / (len(marks) - 1) if len(marks) > 1 else marks[-1] + 1
     return max(1, round(len(marks) * step))
-
-
-def _first_token(tokens: int | Sequence[int]) -> int:
-    return tokens if isinstance(tokens, int) else tokens[0]
 
 
 def _decoder_parts(network: Any, name: str) -> tuple[Any, Any]:

@@ -106,17 +106,15 @@ def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) 
     return unsound_layers(workspace, StatesCell.parse(str(key)), output.rows(HIDDEN_STATES)[0].n_layers)
 
 
-def _lost_states(workspace: Workspace, key: str) -> list[str]:
-    return [] if versions.has_states(workspace, StatesCell.parse(key)) else ["its states are gone"]
-
-
 @_stage(
     HIDDEN_STATES,
     parents=[of(probe_items, by_dataset), of(extraction_settings, by_extraction)],
     scheme=schemes.STATES,
     kinds=["parquet", "pytorch"],
     cost="machine",
-    lost=_lost_states,
+    lost=lambda workspace, key: (
+        [] if versions.has_states(workspace, StatesCell.parse(key)) else ["its states are gone"]
+    ),
     checks=[Check("states_finite", "Every number of the first and last layer is finite.", _unsound_layers)],
 )
 def hidden_states(workspace: Workspace, key: str) -> StageOutput:
@@ -157,17 +155,15 @@ def probes(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(probe_rows(workspace, Extraction.parse(key)))
 
 
-def _lost_directions(workspace: Workspace, key: str) -> list[str]:
-    return [] if versions.has_directions(workspace, Extraction.parse(key)) else ["its directions are gone"]
-
-
 @_stage(
     DIRECTIONS,
     code="3",
     parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
     scheme=EXTRACTION,
     wants=steers,
-    lost=_lost_directions,
+    lost=lambda workspace, key: (
+        [] if versions.has_directions(workspace, Extraction.parse(key)) else ["its directions are gone"]
+    ),
 )
 def directions(workspace: Workspace, key: str) -> StageOutput:
     """Return files of each dataset's void direction at every layer, and of its nulls."""
