@@ -143,11 +143,7 @@ def _reasoning(message: Any) -> str | None:
 
 
 def _tokens(usage: dict[str, Any]) -> dict[str, int | None]:
-    """Return the tokens of a call, None if they are unknown.
-
-    inspect_ai's providers count cached input and reasoning within `input_tokens` and `output_tokens` or beside them;
-    the total tells which.
-    """
+    """Return a call's tokens, None if unknown; the total tells whether cached and reasoning ones are counted within."""
     token_counts = {name: value for name, value in usage.items() if type(value) is int}
     cached_tokens = token_counts.get("input_tokens_cache_read", 0) + token_counts.get("input_tokens_cache_write", 0)
     counts: dict[str, Any] = {

@@ -200,10 +200,6 @@ def _read_note(path: Path) -> tuple[int, dict[str, float]]:
 
 
 def _begin(connection: sa.Connection) -> None:
-    """Begin a transaction as SQLite does, or at once with the right to write.
-
-    With that right none of its changes fails later. The driver's own way to begin is switched off
-    (`isolation_level=None`): it would begin only before a change.
-    """
+    """Begin a transaction, at once with the right to write if asked; the driver would begin only before a change."""
     options: Any = connection.get_execution_options()
     connection.exec_driver_sql("begin" if options.get("is_reading") else "begin immediate")

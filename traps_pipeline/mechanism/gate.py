@@ -145,10 +145,7 @@ def _each_fold(
 
 
 def fit_gate(train: Items, folds: int, seed: int, false_abs: float) -> FittedGate:
-    """Return probe, thresholds, and shares of calibrating controls above each.
-
-    train: both sides, in two scenarios or more.
-    """
+    """Return probe, thresholds, and shares of calibrating controls above each; both sides need two scenarios."""
     probe = fit_probe(train.features, train.void)
     calibration_scores, void = _own_scores(train, folds, seed)
     cuts = thresholds(calibration_scores, void, false_abs)

@@ -226,11 +226,7 @@ def _rows(
 
 
 def _resample(outcomes: Outcomes, target: str, scenarios: np.ndarray, resamples: int, seed: int) -> np.ndarray:
-    """Return resampled sums of a dataset's outcomes, (9, 1 + resamples).
-
-    They have an unseen scenario. The datasets of a taxonomy share their resamples, and taxonomies do not. scenarios:
-    (n,), of each item.
-    """
+    """Return resampled sums, (9, 1 + resamples), with one scenario unseen; datasets of a taxonomy share resamples."""
     scenario_columns = {"dataset": target, "run": 1, "scenario_id": scenarios, "taxonomy": probed_taxonomy(target)}
     items = pd.DataFrame(outcomes.counts(), columns=pd.Index(COUNTS)).assign(**scenario_columns)
     return run_sums(items, draw_scenarios(items, resamples, seed), "gate")[target, 1]

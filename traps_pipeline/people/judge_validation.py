@@ -245,11 +245,7 @@ def is_degenerate(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _kappa(first: np.ndarray, second: np.ndarray) -> tuple[float, float, float]:
-    """Return Cohen's kappa and its 95 % interval; NaN if it is degenerate.
-
-    The interval is a Bayesian bootstrap over failures, one of them unseen: at the lower end the annotators differ on
-    it, at the upper end they agree. So the interval keeps a width even if they always agree.
-    """
+    """Return Cohen's kappa and its 95 % interval, a Bayesian bootstrap with one failure unseen; NaN if degenerate."""
     if is_degenerate(first, second):
         return np.nan, np.nan, np.nan
     cells = np.bincount(2 * first.astype(int) + second, minlength=4)  # no and no, no and yes, yes and no, yes and yes

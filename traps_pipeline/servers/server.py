@@ -81,11 +81,7 @@ def study_file(workspace: Workspace, relative: str) -> Path:
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """A server's address, tokens and command.
-
-    tokens: one token, or several tokens with the person of each. behind: the address of an HTTPS proxy in front, if
-    any.
-    """
+    """A server's address, token (or tokens with their persons) and command. behind: an HTTPS proxy in front, if any."""
 
     host: str
     port: int

@@ -66,10 +66,7 @@ def experience(totals: Iterable[Totals]) -> Experience:
 
 
 def forecast(entry: Entry, calls: int, seen: Experience, items: Mapping[str, int] = MappingProxyType({})) -> Forecast:
-    """Forecast a number of new calls; the high end is what a budget reserves.
-
-    items: number of items by dataset, whose clips may differ in size.
-    """
+    """Forecast new calls; the high end is what a budget reserves. items: their number by dataset, for clips' sizes."""
     frames, most_frames = _clip_tokens(entry, items)
     prompt = seen.prompt_tokens or frames + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
     completion = seen.completion_tokens or entry.expected_completion_tokens

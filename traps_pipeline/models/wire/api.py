@@ -237,11 +237,7 @@ class ApiBackend:
         raise TransientError(kind) from None
 
     def _provider_outcome(self, error: ProviderError | None, request: Request, exchange: Exchange) -> Outcome:
-        """Return a provider's error as an outcome, or raise it as TransientError.
-
-        The status is the one on the wire, or the one in the error object if that came with a 200. error: None if the
-        body holds none.
-        """
+        """Return a provider's error (None: the body holds none) as an outcome, or raise it as TransientError."""
         provider_error = error or ProviderError(self._quote_beginning(exchange))
         status = (provider_error.status or UNKNOWN_ERROR) if exchange.is_answered else exchange.status
         assert status is not None
