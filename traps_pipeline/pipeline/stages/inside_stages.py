@@ -24,7 +24,7 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
-from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING
+from traps_pipeline.protocol.regimes import GUIDED, PROBE_PROMPT, PROMPTING
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
@@ -143,6 +143,30 @@ def leads(workspace: Workspace, key: str) -> StageOutput:
     from traps_pipeline.mechanism.leads import lead_rows
 
     return StageOutput(lead_rows(workspace, *_model_and_states(workspace, key)))
+
+
+def _with_two_events(key: str) -> list[str]:
+    """Return the extractions of two events whose layer an extraction's probes choose."""
+    extraction = Extraction.parse(key)
+    is_own = extraction.weights_seed is not None
+    return [key] if is_own else [Extraction(extraction.model, GUIDED).key] if extraction.text == PROBE_PROMPT else []
+
+
+@_stage(
+    tables.INTERACTION,
+    parents=[
+        _STATES,
+        of(probes, to_keys(EXTRACTION, EXTRACTION, _with_two_events), need="some"),
+        of(probe_items, EVERY),
+        probing_settings,
+    ],
+    wants=lambda study, key: study.has_interaction(Extraction.parse(key)),
+)
+def interaction(workspace: Workspace, key: str) -> StageOutput:
+    """Return whether states of two events tell, within a clip, that the asked event is hidden."""
+    from traps_pipeline.mechanism.interaction import interaction_rows
+
+    return StageOutput(interaction_rows(workspace, *_model(workspace, key)))
 
 
 @_stage(
