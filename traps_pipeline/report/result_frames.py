@@ -14,8 +14,8 @@ from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS, JUDGE_VAL
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.control_rows import (
     GATE,
-    ITEM_SCORES,
     INTERACTION,
+    ITEM_SCORES,
     LEADS,
     LENS,
     PATCHING,
