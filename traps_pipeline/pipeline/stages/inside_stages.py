@@ -8,7 +8,7 @@ from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
 from traps_pipeline.mechanism.probing_versions import patching_version, sentence_version
 from traps_pipeline.models.registry.entries import ModelEntry, local_models
 from traps_pipeline.pipeline.partitioning import EVERY, SAME
-from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, PROBED, STATES, by_extraction, these_keys, to_keys
+from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, PROBED, by_extraction, these_keys, to_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
@@ -22,7 +22,7 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
     steers,
 )
 from traps_pipeline.pipeline.wanted import StudyPartitions
-from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, TWO_EVENTS
 from traps_pipeline.protocol.regimes import GUIDED, PROBE_PROMPT, PROMPTING
 from traps_pipeline.storage.parquet import StageOutput
@@ -152,15 +152,10 @@ def _with_two_events(key: str) -> list[str]:
     return [key] if is_own else [Extraction(extraction.model, GUIDED).key] if extraction.text == PROBE_PROMPT else []
 
 
-def _of_two_events(key: str) -> list[str]:
-    cell = StatesCell.parse(key)
-    return [cell.extraction.key] if cell.dataset == TWO_EVENTS else []
-
-
 @_stage(
     tables.INTERACTION,
     parents=[
-        of(hidden_states, to_keys(STATES, EXTRACTION, _of_two_events)),
+        _STATES,
         of(probes, to_keys(EXTRACTION, EXTRACTION, _with_two_events), need="some"),
         of(probe_items, these_keys(PROBED, [TWO_EVENTS])),
         probing_settings,
