@@ -7,14 +7,13 @@ that figure is the confound and claims nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base import progress
 from traps_pipeline.mechanism.baselines import probed_items, raw_features
 from traps_pipeline.mechanism.control_rows import STATES, InteractionRow
 from traps_pipeline.mechanism.gating import chosen_layers
@@ -49,12 +48,8 @@ class LaneDesign:
         """Return the design of items by id. Raises ValueError."""
         items = [lane_item(item_id) for item_id in item_ids]
         hidden = (np.array([getattr(item, f"{name}_hidden") for item in items]) for name in ("asked", "other"))
-        names = (
-            [f"{item.scenario_id}.{item.clip}" for item in items],
-            [item.scenario_id for item in items],
-            [item.scenario_id.rpartition("-")[0] for item in items],
-        )
-        return LaneDesign(*hidden, *(pd.factorize(np.array(values))[0] for values in names))
+        ids = [(f"{i.scenario_id}.{i.clip}", i.scenario_id, i.scenario_id.rpartition("-")[0]) for i in items]
+        return LaneDesign(*hidden, *(pd.factorize(np.array(names))[0] for names in zip(*ids, strict=True)))
 
 
 def interaction_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[InteractionRow]:
@@ -67,20 +62,14 @@ def interaction_rows(workspace: Workspace, entry: ModelEntry, extraction: Extrac
     pixels, words = raw["all frames"][TWO_EVENTS], raw["question words"][TWO_EVENTS]
     rivals = {"pixels": pixels, "words": words, "both added": np.hstack([pixels, words])}
     chosen, joined = _chosen_layer(workspace, states), states.joined
-    rows: list[InteractionRow] = []
-
-    def add(features: str, layer: int, figures: Mapping[str, Mapping[str, Any]]) -> None:
-        at = {"features": features, "layer": layer, "chosen": layer in (chosen, -1)}
-        rows.extend(InteractionRow(**joined, **at, held_out=name, **row) for name, row in figures.items())
-
-    for layer, figures in enumerate(
-        each_layer(lambda n: figures_of(states.read(TWO_EVENTS, n), design, *resampling), states.n_layers)
-    ):
-        progress.current().tick("interaction", f"layers of {extraction.key}", layer + 1, states.n_layers)
-        add(STATES, layer, figures)
-    for name, features in rivals.items():
-        add(name, -1, figures_of(features, design, *resampling))
-    return rows
+    by_layer = each_layer(lambda n: figures_of(states.read(TWO_EVENTS, n), design, *resampling), states.n_layers)
+    figures = {(STATES, layer): of_layer for layer, of_layer in enumerate(by_layer)}
+    figures |= {(name, -1): figures_of(features, design, *resampling) for name, features in rivals.items()}
+    return [
+        InteractionRow(**joined, features=name, layer=layer, chosen=layer in (chosen, -1), held_out=held_out, **row)
+        for (name, layer), by_held_out in figures.items()
+        for held_out, row in by_held_out.items()
+    ]
 
 
 def _chosen_layer(workspace: Workspace, states: StoredStates) -> int | None:
@@ -117,20 +106,18 @@ def figures_of(
         result[name] = {
             "auroc": float(auroc(*area)), "auroc_low": auroc_low, "auroc_high": auroc_high,
             "within": float(clips["won"].mean()), "within_low": within_low, "within_high": within_high,
-            "confound": float(auroc(design.asked, _unseen_scores(features, design.asked, fold_of))),
+            "confound": float(auroc(design.asked, _unseen_scores(features, design.asked, fold_of, fold_of >= 0))),
             "own_effect": float(asked - neither), "other_effect": float(other - neither),
             "n_clips": len(clips), "n_scenarios": len(np.unique(design.scenarios)),
         }  # fmt: skip
     return result
 
 
-def _unseen_scores(
-    features: np.ndarray, label: np.ndarray, folds: np.ndarray, fitted: np.ndarray | None = None
-) -> np.ndarray:
-    """Return scores (n,) of every item by probes fitted on other folds, on `fitted` items of them alone."""
+def _unseen_scores(features: np.ndarray, label: np.ndarray, folds: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """Return scores (n,) of every item by probes fitted on the `fitted` items of other folds."""
     scores = np.empty(len(label))
     for fold in np.unique(folds):
-        train = (folds != fold) if fitted is None else (folds != fold) & fitted
+        train = (folds != fold) & fitted
         scores[folds == fold] = fit_probe(features[train], label[train]).scores(features[folds == fold])
     return scores.round(DECIMALS)
 

@@ -173,16 +173,8 @@ class StudyPartitions:
     def states(self) -> list[str]:
         """Keys of hidden_states; datasets that are no pairs serve only probes."""
         cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
-        return [c.key for c in cells if c.dataset in DATASETS or self._reads(c.dataset, c.extraction)]
-
-    def _reads(self, dataset: str, extraction: Extraction) -> bool:
-        """Return whether states of a dataset that is no pair are extracted: of two events under guided."""
-        is_random = extraction.weights_seed is not None
-        return is_random or extraction.prompt == (GUIDED if dataset == TWO_EVENTS else PROBE_PROMPT)
-
-    def has_interaction(self, extraction: Extraction) -> bool:
-        """Return whether an extraction has states of two events."""
-        return TWO_EVENTS in self.probed and self._reads(TWO_EVENTS, extraction)
+        read = {d: (GUIDED if d == TWO_EVENTS else PROBE_PROMPT, *RANDOM_WEIGHTS) for d in self.probed}
+        return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt in read[c.dataset]]
 
     @cached_property
     def probed_prompts(self) -> tuple[str, ...]:

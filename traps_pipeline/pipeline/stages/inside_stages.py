@@ -22,7 +22,7 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
     steers,
 )
 from traps_pipeline.pipeline.wanted import StudyPartitions
-from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
 from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, TWO_EVENTS
 from traps_pipeline.protocol.regimes import GUIDED, PROBE_PROMPT, PROMPTING
 from traps_pipeline.storage.parquet import StageOutput
@@ -146,10 +146,9 @@ def leads(workspace: Workspace, key: str) -> StageOutput:
 
 
 def _with_two_events(key: str) -> list[str]:
-    """Return the extractions of two events whose layer an extraction's probes choose."""
+    """Return the extraction of two events whose layer an extraction's probes choose."""
     extraction = Extraction.parse(key)
-    is_own = extraction.weights_seed is not None
-    return [key] if is_own else [Extraction(extraction.model, GUIDED).key] if extraction.text == PROBE_PROMPT else []
+    return [Extraction(extraction.model, GUIDED).key if extraction.prompt == PROBE_PROMPT else key]
 
 
 @_stage(
@@ -160,7 +159,7 @@ def _with_two_events(key: str) -> list[str]:
         of(probe_items, these_keys(PROBED, [TWO_EVENTS])),
         probing_settings,
     ],
-    wants=lambda study, key: study.has_interaction(Extraction.parse(key)),
+    wants=lambda study, key: StatesCell(TWO_EVENTS, Extraction.parse(key)).key in study.states,
 )
 def interaction(workspace: Workspace, key: str) -> StageOutput:
     """Return whether states of two events tell, within a clip, that the asked event is hidden."""
