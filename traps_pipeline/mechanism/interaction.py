@@ -95,20 +95,22 @@ def figures_of(
             continue
         fold_of = scenario_folds(groups, n_folds, seed)
         scores = _unseen_scores(features, design.asked, fold_of, one_hidden)
-        clips = _within_clips(scores[one_hidden], design.asked[one_hidden], design.clips[one_hidden], of_one)
-        counts = weights[:, clips["scenario"]]
-        draws = (counts @ clips["won"].to_numpy(float)) / np.where(counts.any(axis=1), counts.sum(axis=1), np.nan)
+        clip_scenarios, won = _within_clips(
+            scores[one_hidden], design.asked[one_hidden], design.clips[one_hidden], of_one
+        )
+        counts = weights[:, clip_scenarios]
+        draws = (counts @ won) / np.where(counts.any(axis=1), counts.sum(axis=1), np.nan)
         area = (design.asked[one_hidden], scores[one_hidden])
         auroc_low, auroc_high = auroc_interval(*area, of_one, weights)
-        within_low, within_high = share_interval(draws, clips["scenario"].nunique())
+        within_low, within_high = share_interval(draws, len(np.unique(clip_scenarios)))
         cells = [scores[(design.asked == a) & (design.other == o)].mean() for a, o in ((0, 0), (1, 0), (0, 1))]
         neither, asked, other = np.array(cells) / (scores.std() or 1.0)
         result[name] = {
             "auroc": float(auroc(*area)), "auroc_low": auroc_low, "auroc_high": auroc_high,
-            "within": float(clips["won"].mean()), "within_low": within_low, "within_high": within_high,
+            "within": float(won.mean()), "within_low": within_low, "within_high": within_high,
             "confound": float(auroc(design.asked, _unseen_scores(features, design.asked, fold_of, fold_of >= 0))),
             "own_effect": float(asked - neither), "other_effect": float(other - neither),
-            "n_clips": len(clips), "n_scenarios": len(np.unique(design.scenarios)),
+            "n_clips": len(won), "n_scenarios": len(np.unique(design.scenarios)),
         }  # fmt: skip
     return result
 
@@ -122,9 +124,11 @@ def _unseen_scores(features: np.ndarray, label: np.ndarray, folds: np.ndarray, f
     return scores.round(DECIMALS)
 
 
-def _within_clips(scores: np.ndarray, asked: np.ndarray, clips: np.ndarray, scenarios: np.ndarray) -> pd.DataFrame:
+def _within_clips(
+    scores: np.ndarray, asked: np.ndarray, clips: np.ndarray, scenarios: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return each clip's scenario, and whether its hidden event's question is scored above the other one (ties .5)."""
     items = pd.DataFrame({"clip": clips, "scenario": scenarios, "asked": asked, "score": scores})
     sides = items.pivot(index=["clip", "scenario"], columns="asked", values="score").dropna()
-    won = (1 + np.sign(sides[True] - sides[False])) / 2
-    return won.rename("won").reset_index()
+    hidden, seen = (sides[side].to_numpy(float) for side in (True, False))
+    return sides.index.get_level_values("scenario").to_numpy(int), (1 + np.sign(hidden - seen)) / 2

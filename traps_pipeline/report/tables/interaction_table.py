@@ -30,7 +30,7 @@ def interaction_table(results: Results) -> PrintedTable:
     rows = results.interaction
     rows = rows.loc[rows["chosen"].eq(True)].astype({"model": object, "prompt": object})
     effects = {"regime": "prompt", "own_effect": "answers_own", "other_effect": "answers_other"}
-    answers = results.two_way[["model", *effects]].rename(columns=effects).astype({"model": object, "prompt": object})
+    answers = results.two_way.rename(columns=effects)[["model", *effects.values()]].astype({"model": object})
     rows = rows.merge(answers, on=["model", "prompt"], how="left")
     is_one = rows["joins"].isna() & (rows["features"] == STATES)
     rows[["answers_own", "answers_other"]] = rows[["answers_own", "answers_other"]].where(is_one)
