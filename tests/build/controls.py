@@ -10,6 +10,7 @@ import pandas as pd
 
 from traps_pipeline.mechanism.control_rows import (
     GATE,
+    INTERACTION,
     ITEM_SCORES,
     LEADS,
     LENS,
@@ -59,6 +60,17 @@ def leads() -> pd.DataFrame:
         others["first-token logits"] = rival - 0.05
         rows += [at | own, *(at | {"features": name, "auroc": value} for name, value in others.items())]
     return frame(LEADS, *rows)
+
+
+def interaction() -> pd.DataFrame:
+    """States tell .9 within a clip and .8 over clips, those of random weights half; the unchosen layer tells all."""
+    rows = []
+    for prompt, auroc, within in (("guided", 0.8, 0.9), ("random_0", 0.5, 0.5)):
+        at = {"prompt": prompt, "features": "states", "layer": 3, "held_out": "families", "chosen": True}
+        at |= {"auroc": auroc, "within": within, "confound": 0.95, "own_effect": 1.0, "other_effect": 0.0}
+        others = ({"layer": 4, "chosen": False}, {"features": "words", "layer": -1}, {"held_out": "scenarios"})
+        rows += [at, *(at | other | {"auroc": 1.0, "within": 1.0} for other in others)]
+    return frame(INTERACTION, *rows)
 
 
 def gate() -> pd.DataFrame:
@@ -146,6 +158,7 @@ class Made(Results):
     patching = cached_property(lambda _: patching())
     item_scores = cached_property(lambda _: item_scores())
     leads = cached_property(lambda _: leads())
+    interaction = cached_property(lambda _: interaction())
     cosines = cached_property(lambda _: frame(COSINES))
     effects = cached_property(lambda _: effects())
     lens = cached_property(lambda _: lens())

@@ -89,7 +89,7 @@ def test_what_can_cost_money_is_marked() -> None:
     assert {s.name for s in GRAPH.stages if s.cost == "money"} == paid
     assert {s.name for s in GRAPH.stages if s.cost == "machine"} == {
         *("hidden_states", "steering", "steering_fluency"),
-        *("probe_baselines", "gate", "leads", "lens", "item_scores", "sentences", "patching"),
+        *("probe_baselines", "gate", "leads", "interaction", "lens", "item_scores", "sentences", "patching"),
     }
 
 

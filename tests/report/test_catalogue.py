@@ -340,7 +340,7 @@ def test_whatever_reads_figures_that_the_panel_decided_says_who_judged():
     while new := {child for name in new for child in the_graph().below(name)} - below:
         below |= new
     not_the_panels = {"confabulation_prevalence", "human_row", "human_agreement", "panel_errors"}
-    not_the_panels |= {"probes", "probe_baselines", "leads"}  # verdicts choose the items of Cf->Cf
+    not_the_panels |= {"probes", "probe_baselines", "leads", "interaction"}  # verdicts choose the items of Cf->Cf
     reads = {stage for report in (*TABLE_REPORTS, *FIGURE_REPORTS) for stage in report.reads}
     assert (reads & below) - not_the_panels == JUDGED_STAGES
 

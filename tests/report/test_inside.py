@@ -26,6 +26,7 @@ from traps_pipeline.report.tables.inside_columns import why
 from traps_pipeline.report.tables.patching_tables import patching as patching_table
 from traps_pipeline.report.tables.steering_tables import steering as steering_tables
 from traps_pipeline.report.writing import PrintedTable
+from traps_pipeline.scoring.score_rows import TWO_WAY
 from traps_pipeline.storage.study import Layers, MechanismSettings, Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -49,7 +50,7 @@ def test_a_claim_is_held_only_where_no_control_that_must_fail_holds_too() -> Non
 
 
 def test_claims_stand_beside_random_weights_placebos_and_the_best_rival() -> None:
-    table, rivals = claim_tables(Made())
+    table, _, rivals = claim_tables(Made())
     rows = {row["Claim"]: row for row in cells(table)}
     lead = rows["states tell visual voids better than all rivals"]
     assert [lead[name] for name in ("model", "random 0", "random 1", "placebo")] == ["0.200", "0.150", "–", "0.050"]
@@ -59,6 +60,28 @@ def test_claims_stand_beside_random_weights_placebos_and_the_best_rival() -> Non
     assert (own["States"], own["Question words"], own["Best rival"], own["Lead"]) == (
         "0.900", "0.700", "question words", "0.200",
     )  # fmt: skip
+
+
+def test_the_first_claim_is_the_interaction_at_the_chosen_layer_with_families_held_out_beside_the_answers() -> None:
+    made = Made()
+    answers = {"model": "m", "regime": "guided", "own_effect": 0.7, "other_effect": 0.6}
+    made.two_way = pd.DataFrame([answers]).reindex(columns=pd.Index(TWO_WAY.names))
+    claims_of, table, _ = claim_tables(made)
+    first = cells(claims_of)[0]
+    assert [first[name] for name in ("model", "random 0", "random 1", "Verdict")] == ["0.800", "0.500", "–", "holds"]
+    rows = {(row["Prompt"], row["Read from"], row["Held out"]): row for row in cells(table)}
+    own, words = (rows["guided", features, "families"] for features in ("states", "words"))
+    assert (own["Within a clip"], own["Confound"], own["Answers: own"], own["other"]) == (
+        "0.90",
+        "0.95",
+        "0.70",
+        "0.60",
+    )
+    assert words["Answers: own"] == rows["random_0", "states", "families"]["Answers: own"] == "–"
+    made.interaction = made.interaction.assign(within=0.9)  # random weights of which the AUROC alone is at chance
+    assert claim_frame(made)["verdict"].iloc[0] == "holds"
+    made.interaction = made.interaction.assign(auroc=0.9)
+    assert claim_frame(made)["verdict"].iloc[0] == "holds in random 0 too"
 
 
 def test_a_row_that_joins_two_models_is_left_out_of_claims() -> None:
@@ -126,7 +149,7 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
 
 # The numbers of each sentence, in their order.
 FINDINGS = {
-    "claims": "3 17",  # above the shipped figures of the pocket without the gap, and in no other control
+    "claims": "4 18",  # above the shipped figures of the pocket without the gap, and in no other control
     "leads": "0.90 0.70 +0.20 +0.05 +0.30",
     "lens": "+3.0 +9.0 +1.0 +1.0",  # standard, guided; one layer before
     "patching": "0.99 0 1 1 0.99 0 1 1",  # share, layer, panels of panels

@@ -197,6 +197,34 @@ class LeadRow(ExtractionColumns):
 
 LEADS = Table("leads", LeadRow, partition_by=("model", "prompt"), key=("subject", "target", "features"))
 
+Chance = Annotated[float | None, "95 % interval, scenarios resampled, probes held fixed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InteractionRow(JoinedColumns):
+    """Whether features tell, of clips of two events, that the asked one is hidden; chance is 0.5."""
+
+    features: Annotated[str, "states; or a rival, 0.5 by design: pixels, words, or both added"]
+    layer: Annotated[int, "of the states; -1 for rivals"]
+    held_out: Annotated[str, "what probes have not seen: scenarios or families"]
+    chosen: Annotated[bool, "whether it is the layer at which pairs of other datasets transfer best, or a rival"]
+    auroc: Annotated[float, "asked event hidden against the other one, fitted and read on clips that hide one event"]
+    auroc_low: Chance
+    auroc_high: Chance
+    within: Annotated[float, "share of these clips whose hidden event's question is scored above the other one"]
+    within_low: Chance
+    within_high: Chance
+    confound: Annotated[float, "AUROC of the same probe over all eight items: the number of boards tells; no claim"]
+    own_effect: Annotated[float, "rise of the score from no event hidden to the asked one alone, in its deviations"]
+    other_effect: Annotated[float, "the same to the other one alone"]
+    n_clips: Annotated[int, "clips that hide one event"]
+    n_scenarios: Annotated[int, "scenarios of two events"]
+
+
+INTERACTION = Table(
+    "interaction", InteractionRow, partition_by=("model", "prompt"), key=("features", "layer", "held_out")
+)
+
 UNSEEN = "log-odds of void above the mid threshold, by a probe that has not seen the scenario"
 
 

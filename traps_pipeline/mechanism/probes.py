@@ -210,10 +210,15 @@ def auroc_interval(
     column of `weights` for each item. A resample in which a class is empty is dropped.
     """
     void, areas = np.asarray(void, bool), auroc_draws(void, scores, scenario, weights)
-    if np.isnan(areas).all():
+    return share_interval(areas, min(len(np.unique(scenario[side])) for side in (void, ~void)), level)
+
+
+def share_interval(draws: np.ndarray, scenarios: int, level: float = 0.95) -> tuple[float, float]:
+    """Return the percentile interval of draws of a share of scenarios, with the minimum width of `auroc_interval`."""
+    if np.isnan(draws).all():
         return np.nan, np.nan
-    low, high = np.nanquantile(areas, [(1 - level) / 2, (1 + level) / 2])
-    certain_share = ((1 - level) / 2) ** (1 / min(len(np.unique(scenario[side])) for side in (void, ~void)))
+    low, high = np.nanquantile(draws, [(1 - level) / 2, (1 + level) / 2])
+    certain_share = ((1 - level) / 2) ** (1 / scenarios)
     return min(float(low), certain_share), max(float(high), 1 - certain_share)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -28,9 +29,9 @@ class StoredStates:
     items: pd.DataFrame
 
     @staticmethod
-    def of(workspace: Workspace, extraction: Extraction) -> StoredStates:
-        """Return an extraction's states. Raises TrapsError if nothing was extracted."""
-        items = workspace.tables.read_all(HIDDEN_STATES, dataset=PROBED_DATASETS, **extraction.partition)
+    def of(workspace: Workspace, extraction: Extraction, datasets: Sequence[str] = PROBED_DATASETS) -> StoredStates:
+        """Return an extraction's states of datasets. Raises TrapsError if nothing was extracted."""
+        items = workspace.tables.read_all(HIDDEN_STATES, dataset=datasets, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
         return StoredStates(workspace, extraction, items.reset_index(drop=True))

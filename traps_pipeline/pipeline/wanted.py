@@ -11,6 +11,7 @@ from functools import cached_property
 from itertools import product
 
 from traps_pipeline.benchmark.corrections import categories_of, load_scenarios, load_two_events
+from traps_pipeline.models.local.capture import OF_PAIRS
 from traps_pipeline.models.registry.entries import get_model, load_models, local_models
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell, SteeringCell
 from traps_pipeline.protocol.datasets import (
@@ -18,12 +19,13 @@ from traps_pipeline.protocol.datasets import (
     ANSWERABLE,
     CATEGORIES,
     DATASETS,
+    EXTRACTED,
     PROBED_ARMS,
-    PROBED_DATASETS,
+    TWO_EVENTS,
     UNPAIRED,
     all_datasets_of,
 )
-from traps_pipeline.protocol.regimes import PROBE_PROMPT, RANDOM_WEIGHTS, REGIMES, VQA_PROMPTS
+from traps_pipeline.protocol.regimes import GUIDED, PROBE_PROMPT, RANDOM_WEIGHTS, REGIMES, VQA_PROMPTS
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS
 from traps_pipeline.storage.study import Asked, MechanismSettings
 from traps_pipeline.storage.workspace import Workspace
@@ -148,7 +150,10 @@ class StudyPartitions:
         asked_datasets = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
         existing = {*datasets, *(arm for arm in PROBED_ARMS if self._mechanism and arm in asked_datasets)}
         existing |= {ANSWERABLE} if "occlusion" in existing else set()
-        return [d for d in PROBED_DATASETS if d in existing]
+        settings = self._mechanism[1] if self._mechanism else None
+        if datasets and not (settings and settings.pooling in OF_PAIRS):  # their layer is chosen on pairs
+            existing |= {TWO_EVENTS} & {*asked_datasets}
+        return [d for d in EXTRACTED if d in existing]
 
     @cached_property
     def extractions(self) -> list[Extraction]:
@@ -168,7 +173,8 @@ class StudyPartitions:
     def states(self) -> list[str]:
         """Keys of hidden_states; datasets that are no pairs serve only probes."""
         cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
-        return [c.key for c in cells if c.dataset in DATASETS or c.extraction.text == PROBE_PROMPT]
+        read = {d: (GUIDED if d == TWO_EVENTS else PROBE_PROMPT, *RANDOM_WEIGHTS) for d in self.probed}
+        return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt in read[c.dataset]]
 
     @cached_property
     def probed_prompts(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from traps_pipeline.base.names import check_name
-from traps_pipeline.protocol.datasets import DATASETS, PROBED_DATASETS, UNPAIRED
+from traps_pipeline.protocol.datasets import DATASETS, EXTRACTED, UNPAIRED
 from traps_pipeline.protocol.regimes import PROBE_PROMPT, RANDOM_WEIGHTS, REGIMES, VQA_PROMPTS
 
 _EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][0-9]*)")
@@ -132,8 +132,8 @@ class StatesCell:
     def parse(key: str) -> StatesCell:
         """Parse a cell's key. Raises ValueError that says what is wrong."""
         dataset, _, extraction = key.partition("|")
-        if dataset not in PROBED_DATASETS:
-            raise ValueError(f"states key {key!r}: dataset {dataset!r} is not one of {PROBED_DATASETS}")
+        if dataset not in EXTRACTED:
+            raise ValueError(f"states key {key!r}: dataset {dataset!r} is not one of {EXTRACTED}")
         return StatesCell(dataset, Extraction.parse(extraction))
 
 

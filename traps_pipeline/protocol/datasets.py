@@ -52,6 +52,7 @@ _ONE_TAXONOMY = {
 ANSWERABLE = "occlusion_answerable"  # only in mechanistic stages: occlusion's voids, answerable
 PROBED_ARMS = ("length_matched",)  # arms that probes are applied to where an experiment asks them
 PROBED_DATASETS = (*DATASETS, ANSWERABLE, *PROBED_ARMS)
+EXTRACTED = (*PROBED_DATASETS, TWO_EVENTS)  # all whose hidden states may be extracted
 SIDES = ("control", "void")
 
 

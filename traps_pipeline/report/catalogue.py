@@ -32,6 +32,7 @@ JUDGED_STAGES = {
     *("steering_effects", "steering_shares", "steering_nulls", "steering_pecs"),
 }
 CLAIM_STAGES = (
+    *("interaction", "two_way"),
     *("leads", "probes", "probe_baselines", "gate", "item_scores", "sentences", "lens", "patching"),
     *("cosines", "steering_effects", "steering_nulls"),
 )

@@ -14,6 +14,7 @@ from traps_pipeline.judging.judging_rows import AGREEMENT, JUDGE_BIAS, JUDGE_VAL
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.control_rows import (
     GATE,
+    INTERACTION,
     ITEM_SCORES,
     LEADS,
     LENS,
@@ -133,6 +134,7 @@ class Results:
     shares = table_frame(STEERING_SHARES)
     steering_regimes = cached_property(lambda results: effects.regime_matrix(results.effects))
     leads = table_frame(LEADS)
+    interaction = table_frame(INTERACTION)
     lens = table_frame(LENS)
     sentences = table_frame(SENTENCES)
     item_scores = table_frame(ITEM_SCORES)  # under PROBE_PROMPT alone

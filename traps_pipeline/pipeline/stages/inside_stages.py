@@ -8,7 +8,7 @@ from traps_pipeline.mechanism.mechanism_rows import STEERING_EFFECTS
 from traps_pipeline.mechanism.probing_versions import patching_version, sentence_version
 from traps_pipeline.models.registry.entries import ModelEntry, local_models
 from traps_pipeline.pipeline.partitioning import EVERY, SAME
-from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, by_extraction, these_keys, to_keys
+from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, PROBED, by_extraction, these_keys, to_keys
 from traps_pipeline.pipeline.stage import of, source, stage
 from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
@@ -22,9 +22,9 @@ from traps_pipeline.pipeline.stages.mechanism_stages import (
     steers,
 )
 from traps_pipeline.pipeline.wanted import StudyPartitions
-from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
-from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS
-from traps_pipeline.protocol.regimes import PROBE_PROMPT, PROMPTING
+from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
+from traps_pipeline.protocol.datasets import DATASETS, PROBED_ARMS, TWO_EVENTS
+from traps_pipeline.protocol.regimes import GUIDED, PROBE_PROMPT, PROMPTING
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
 
@@ -143,6 +143,29 @@ def leads(workspace: Workspace, key: str) -> StageOutput:
     from traps_pipeline.mechanism.leads import lead_rows
 
     return StageOutput(lead_rows(workspace, *_model_and_states(workspace, key)))
+
+
+def _with_two_events(key: str) -> list[str]:
+    """Return the extraction of two events whose layer an extraction's probes choose."""
+    extraction = Extraction.parse(key)
+    return [Extraction(extraction.model, GUIDED).key if extraction.prompt == PROBE_PROMPT else key]
+
+
+@_stage(
+    tables.INTERACTION,
+    parents=[
+        _STATES,
+        of(probes, to_keys(EXTRACTION, EXTRACTION, _with_two_events), need="some"),
+        of(probe_items, these_keys(PROBED, [TWO_EVENTS])),
+        probing_settings,
+    ],
+    wants=lambda study, key: StatesCell(TWO_EVENTS, Extraction.parse(key)).key in study.states,
+)
+def interaction(workspace: Workspace, key: str) -> StageOutput:
+    """Return whether states of two events tell, within a clip, that the asked event is hidden."""
+    from traps_pipeline.mechanism.interaction import interaction_rows
+
+    return StageOutput(interaction_rows(workspace, *_model(workspace, key)))
 
 
 @_stage(

@@ -18,6 +18,7 @@ from traps_pipeline.protocol.regimes import GUIDED, RANDOM_WEIGHTS, STANDARD
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.control_reports import prompts
 from traps_pipeline.report.tables.inside_columns import short_names, why
+from traps_pipeline.report.tables.interaction_table import interaction_table
 from traps_pipeline.report.tables.table_columns import MODEL as MODEL_COLUMN
 from traps_pipeline.report.writing import Column, PrintedTable, fraction
 
@@ -220,8 +221,18 @@ def _same_direction(results: Results, model: str) -> float | None:
     )
 
 
+def _interaction(results: Results, model: str, subject: str) -> float | None:
+    """Return the lower of AUROC and share within a clip, at the chosen layer with families held out."""
+    rows = results.interaction
+    rows = rows.loc[(rows["model"] == model) & (rows["prompt"] == {MODEL: GUIDED}.get(subject, subject))]
+    rows = rows.loc[(rows["features"] == STATES) & (rows["held_out"] == "families") & rows["chosen"].eq(True)]
+    return _mean(rows[["auroc", "within"]].min(axis=1))
+
+
 _ALL, _GAP = (*RANDOM, PLACEBO, NO_GAP), (*RANDOM, PLACEBO)
 CLAIMS = (
+    Claim("interaction", "states tell that the asked event is hidden", "AUROC and share in a clip, the lower", 0.65,
+          _interaction, RANDOM),
     Claim("lead_visual", "states tell visual voids better than all rivals", "AUROC, states − best rival", 0.1,
           _by_features(_lead, VISUAL), _GAP),
     Claim("lead_textual", "states tell ill-posed voids better than all rivals", "AUROC, states − best rival", 0.1,
@@ -266,7 +277,7 @@ def claim_frame(results: Results) -> pd.DataFrame:
     import pandas as pd
 
     rows, without_gap = [], no_gap_figures()
-    tables = (results.leads, results.prompted_probes, results.patching)
+    tables = (results.interaction, results.leads, results.prompted_probes, results.patching)
     for model in dict.fromkeys(str(model) for table in tables for model in table["model"]):
         for claim in CLAIMS:
             values, note = {NO_GAP: without_gap.get(claim.name)}, ""
@@ -307,7 +318,7 @@ def no_gap_figures() -> dict[str, float]:
 
 def claims(results: Results) -> list[PrintedTable]:
     """Return each claim in the model and in its controls, then what states and rivals tell."""
-    return [_claims(results), _leads(results)]
+    return [_claims(results), interaction_table(results), _leads(results)]
 
 
 def _claims(results: Results) -> PrintedTable:

@@ -1,0 +1,71 @@
+"""Whether states hold the interaction of two events: planted states, worked out by hand, and one real run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.build.inside import with_mechanism
+from tests.conftest import Checkout
+from traps_pipeline.mechanism.control_rows import INTERACTION
+from traps_pipeline.mechanism.interaction import LaneDesign, figures_of
+from traps_pipeline.protocol.two_events import lane_items
+from traps_pipeline.storage.workspace import Workspace
+
+SCENARIOS = [f"{family}-e00{n}" for family in ("chain", "slide", "tower", "spring") for n in (1, 2, 3)]
+DESIGN = LaneDesign.of([item.item_id for scenario in SCENARIOS for item in lane_items(scenario)])
+BOARDS = DESIGN.asked.astype(float) + DESIGN.other
+CHANCE = pytest.approx({"auroc": 0.5, "within": 0.5, "own_effect": 0.0, "other_effect": 0.0})
+
+
+def figures(features: np.ndarray, held_out: str = "families") -> dict[str, float]:
+    return figures_of(features, DESIGN, folds=3, resamples=200, seed=0)[held_out]
+
+
+@pytest.mark.parametrize("held_out", ["scenarios", "families"])
+def test_planted_interaction_is_read_in_every_clip_and_follows_the_asked_event_alone(held_out: str) -> None:
+    found = figures(DESIGN.asked[:, None].astype(float), held_out)
+    assert (found["auroc"], found["within"], found["confound"]) == (1.0, 1.0, 1.0)
+    # Half of the items hide the asked event: one column of two values has deviation half their distance.
+    assert found["own_effect"] == pytest.approx(2.0, abs=0.1) and found["other_effect"] == pytest.approx(0.0, abs=0.1)
+    assert (found["n_clips"], found["n_scenarios"]) == (24, 12)
+    assert found["within_high"] == 1.0 and found["within_low"] == pytest.approx(0.025 ** (1 / 12))
+
+
+def test_what_tells_the_number_of_boards_alone_is_at_chance_and_only_the_confound_shows_it() -> None:
+    found = figures(BOARDS[:, None])
+    assert {name: found[name] for name in ("auroc", "within", "own_effect", "other_effect")} == CHANCE
+    # 1 or 2 boards where the asked event is hidden, 0 or 1 where it is seen: three of four pairs win, one ties.
+    assert found["confound"] == pytest.approx((3 + 0.5) / 4)
+
+
+def test_what_clip_and_question_tell_apart_adds_up_to_chance_within_every_clip() -> None:
+    questions = np.array([item.lane == "left" for scenario in SCENARIOS for item in lane_items(scenario)], float)
+    noise = np.random.default_rng(0).standard_normal((DESIGN.clips.max() + 1, 5))[DESIGN.clips]
+    found = figures(np.column_stack([questions, noise]), "scenarios")
+    assert (found["within"], found["auroc"]) == (0.5, pytest.approx(0.5, abs=0.02))
+
+
+def test_families_are_not_held_out_where_there_is_one() -> None:
+    design = LaneDesign.of([item.item_id for n in range(4) for item in lane_items(f"chain-e00{n}")])
+    features = design.asked[:, None].astype(float)
+    assert [*figures_of(features, design, folds=2, resamples=20, seed=0)] == ["scenarios"]
+
+
+@pytest.mark.slow
+def test_traps_run_reads_two_events_in_a_model_and_in_its_random_weights(own_study: Checkout) -> None:
+    path = own_study.root / with_mechanism(own_study)
+    experiment = yaml.safe_load(path.read_text())
+    experiment["datasets"] += ["two_events"]
+    experiment["scenarios"] += ["domino_chain-e001", "slide-e001"]
+    experiment["mechanism"] |= {"prompts": ["standard", "guided"], "steering": None, "patching": None}
+    path.write_text(yaml.safe_dump(experiment))
+    own_study.traps("run", path.name, "--until", "interaction").ok()
+    rows = Workspace.open(own_study.workspace).tables.read_all(INTERACTION)
+    assert {*rows["prompt"]} == {"guided", "random_0", "random_1"}
+    states, rivals = (rows.loc[rows["layer"].ge(0) == of_states] for of_states in (True, False))
+    assert len(states) == 3 * 2 * 5 and {*states.loc[states["chosen"]].groupby(["prompt", "held_out"]).size()} == {1}
+    assert {*rivals["features"]} == {"pixels", "words", "both added"}
+    assert rivals[["auroc", "within"]].to_numpy() == pytest.approx(0.5)
+    assert rivals.loc[rivals["features"] == "pixels", "confound"].min() > 0.5  # a board is seen
