@@ -31,7 +31,7 @@ def test_traps_run_looks_into_a_model_once(own_study: Checkout) -> None:
     assert len(judged) > answers  # controls stand in two datasets
     assert len(effects.groupby(["source", "target"])) == 4  # the paths between the two
     nulls, baselines = tables.read(STEERING_NULLS, {}), tables.read_all(PROBE_BASELINES)
-    assert set(nulls["draws"]) == {2} and set(nulls["dose"]) == {1}
+    assert set(nulls["draws"]) == {2} and set(nulls["dose"]) == {1, 5}  # the largest gap, and each alpha
     assert {"question words", "output margin", "noise"} <= set(baselines["features"])
     patched = tables.read_all(PATCHING)
     assert patched.query("layer == 4 and group == 'last' and source == 'pair' and site == 'residual'")["n"].max() == 2

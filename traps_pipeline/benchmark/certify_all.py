@@ -1,7 +1,5 @@
 """Certify a whole benchmark on all cores, resumably, with a table of results."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence

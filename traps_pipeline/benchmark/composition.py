@@ -1,7 +1,5 @@
 """Sample a benchmark with set numbers of scenarios, and check it as a whole."""
 
-from __future__ import annotations
-
 import uuid
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

@@ -5,8 +5,6 @@ synced to disk before it is confirmed; so a kill loses no confirmed decision, an
 the other.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

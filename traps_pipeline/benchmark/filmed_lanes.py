@@ -1,7 +1,5 @@
 """Render scenarios of two events, four clips each, and make their rows of the arms table."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Items of one scenario are recognized by their frames, and how many there are, or
 a held-out set asks one item of each scenario, which its key draws.
 """
 
-from __future__ import annotations
-
 import hmac
 import json
 import re

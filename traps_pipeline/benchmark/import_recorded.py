@@ -4,8 +4,6 @@ Each pair is made once: its record and its clips stay in the benchmark's folder 
 and the code, so that a killed import goes on, and a second one makes what changed.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Turn scenarios and clips into questions, two per pair (docs/spec.md 1 and 2)."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Measure that nothing in view tells hidden lanes of two events from seen ones."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator
 

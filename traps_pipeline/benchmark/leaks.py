@@ -4,8 +4,6 @@ A cue is what one look without understanding tells: a clip's length, a question'
 of the cue alone, fitted on other scenarios (five folds).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations

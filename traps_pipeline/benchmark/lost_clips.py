@@ -1,7 +1,5 @@
 """Find a study's missing clips without importing the renderer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from traps_pipeline.scenes.worlds.clip_notes import note_of

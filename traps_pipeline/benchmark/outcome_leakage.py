@@ -5,8 +5,6 @@ common: if a ball on the left ends on the left more often than not, a rule that 
 outcome without knowing physics.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

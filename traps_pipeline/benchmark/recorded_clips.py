@@ -1,7 +1,5 @@
 """Make the clips of a recorded pair (control, void by cut, cover or another clip, and twin), and find them again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ All processes go through the same rows. Each leases a free row, makes its missin
 goes on to the next. Leases of dead processes expire. `share` returns when every clip exists.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

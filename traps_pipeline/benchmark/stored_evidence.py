@@ -4,8 +4,6 @@ The evidence was measured when the scenario was resolved; `scenes.certification.
 the trajectories.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

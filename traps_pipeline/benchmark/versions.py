@@ -5,8 +5,6 @@ A part (a category's specs or clips, a dataset's items) has the release's versio
 in place agree.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from typing import Any

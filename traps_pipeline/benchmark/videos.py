@@ -1,7 +1,5 @@
 """Render scenarios to clips, each once, and build the table of clips."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from functools import partial

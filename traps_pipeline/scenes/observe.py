@@ -4,8 +4,6 @@ It shows that the benchmark is solvable from pixels. It finds the family by the 
 that no family asks, an ill-posed one above all, is one it cannot answer.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Encode frames as H.264 clips (always the same bytes) and decode them, with PyAV."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial

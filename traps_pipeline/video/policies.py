@@ -1,7 +1,5 @@
 """Choose which frames of a clip a model is shown: a time grid, or evenly spaced."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Certify a world of two lanes: what is seen in its four clips, and what never is."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any

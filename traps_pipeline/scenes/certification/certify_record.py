@@ -3,8 +3,6 @@
 `certificates` defines them; `docs/scenes.md` says what each promises and what it does not.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

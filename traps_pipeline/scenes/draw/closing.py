@@ -4,8 +4,6 @@ In an occlusion scene the occluder is the void's. In a chaotic scene it stands b
 before whatever moves in either world. Every control closes that can (docs/design/twins.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any

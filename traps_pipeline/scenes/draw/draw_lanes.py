@@ -1,7 +1,5 @@
 """Draw scenarios of two events: two draws of a family that differ in nothing but shape, place and outcome."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

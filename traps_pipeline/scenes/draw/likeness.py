@@ -1,7 +1,5 @@
 """Find lookalikes among records, so that a family shows many different scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import combinations
 

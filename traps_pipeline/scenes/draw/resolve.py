@@ -3,8 +3,6 @@
 Only `resolve` creates records; it raises `Rejected`, with the reason, for a draw without a valid pair.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

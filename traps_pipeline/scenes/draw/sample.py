@@ -4,8 +4,6 @@ Draws are numbered and independent, so they run on all cores; acceptance goes th
 seed gives the same scenarios. Every accepted scenario is written at once: a sampling that was stopped goes on.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -7,8 +7,6 @@ upright on the floor as before, and the camera stays. What else the family's box
 both worlds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ Hidden element: the place of a counterweight on the other arm. Close to the pivo
 outweighs the ball, and at one place between the beam hangs level.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ second window. Void: the occluder stands before the wall and the tray.
 Hidden element: a block, which lies across the lane below the second window or beside the lane.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ Hidden element: the pad that the ball lands on, which is lively (the ball leaps 
 the wall). The pads look the same, and nothing that the ball does before it lands tells them apart.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ pen. Hidden element: the basket, which stands where the ball comes down or a ste
 same either way, and the walls of the pen keep the ball behind the occluder.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

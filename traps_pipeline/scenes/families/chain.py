@@ -5,8 +5,6 @@ Hidden element: a peg that stands between two balls of the row and stops the imp
 The ramp ends in a step, so that nothing that happens in the row comes back out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from traps_pipeline.scenes.parts.course import SHADOW_BACK, Course, Surface

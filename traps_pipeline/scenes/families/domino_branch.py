@@ -6,8 +6,6 @@ The last visible domino only kicks a ball that rolls behind the occluder, drives
 stopped by a post there: nothing that the gap changes can push back on what is seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

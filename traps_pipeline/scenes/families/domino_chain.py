@@ -6,8 +6,6 @@ The last visible domino only kicks a ball that is behind the occluder from the s
 has struck the second part: nothing that the gap changes can push back on what is seen.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ The last visible domino only kicks a ball that is behind the occluder from the s
 has struck the second row: nothing that the gap changes can push back on what is seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

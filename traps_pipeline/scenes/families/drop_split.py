@@ -5,8 +5,6 @@ Hidden element: the ridge, which stands a little to the left or to the right of 
 the same either way and drifts to either side, whichever the ridge then turns the ball to.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import atan2, hypot

@@ -5,8 +5,6 @@ Hidden element: the two boards of the funnel, which leave a throat that is wider
 rolls in the same either way, and in either case it stays behind the occluder.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import cos, radians, sin

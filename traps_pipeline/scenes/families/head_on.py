@@ -5,8 +5,6 @@ Hidden element: a rough board on one half of the deck. The ball that crosses it 
 ramps end in steps, so that neither ball comes back out; their small head starts are only a lure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -5,8 +5,6 @@ Hidden element: a switch board, which lies between the lanes or is turned so tha
 Which lanes the balls enter by does not tell: balls of one lane may be parted, balls of two lanes brought together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

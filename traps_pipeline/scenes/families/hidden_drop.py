@@ -5,8 +5,6 @@ Hidden element: the plate is tilted to the left or to the right. The ball drops 
 track and the chute look like; a board behind the bins catches the shadows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import radians

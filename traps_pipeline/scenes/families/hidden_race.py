@@ -5,8 +5,6 @@ Hidden element: inside the tunnel every lane but one crosses a rough board that 
 run-up says nothing about which lane is clear, so the ball that enters first is only a lure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ Hidden element: the barrier, which is low (the ball flies over it) or tall (the 
 between kicker and barrier). The slide says nothing about it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

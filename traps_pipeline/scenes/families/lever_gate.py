@@ -6,8 +6,6 @@ Hidden element: the counterweight on the lever, which sits far out (the lever ho
 back.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Control: the whole run, until all three lie in the coloured zones at the bottom.
 peg magnifies a difference in a ball's path about tenfold, so that what no pixel shows at the cut decides the count.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ the bob reaches the block, or farther along, where the rod does not get. The bal
 down a step there, and a lip stops it once it has struck.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

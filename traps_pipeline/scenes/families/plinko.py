@@ -5,8 +5,6 @@ whole run. Void: the clip ends before the buckets. Each peg magnifies a differen
 that what no pixel shows at the cut decides the bucket.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

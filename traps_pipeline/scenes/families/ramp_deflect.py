@@ -4,8 +4,6 @@ Control: the table and the bins at its sides are in view. Void: the occluder sta
 Hidden element: the deflector on the table, a board that is turned to the left or to the right.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

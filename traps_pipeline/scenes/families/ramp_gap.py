@@ -4,8 +4,6 @@ Control: the whole deck and the box are in view. Void: the occluder stands befor
 Hidden element: a board that bridges a gap in the deck, or lies on the ground below it, so that the ball falls in.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from traps_pipeline.scenes.parts.course import SHADOW_RIGHT, Course, Span

@@ -5,8 +5,6 @@ view. Hidden element: one of the tracks crosses a rough board that slows its bal
 places, of which one is higher than the other, say nothing about which track it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ Hidden element: a patch of the track before the line, rough enough to stop the b
 A ball that passes the line stays at the felt before the end wall.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -7,8 +7,6 @@ ends before that. Each peg magnifies a difference in the ball's path about tenfo
 cut decides the place. Boards, what stands beside them and the floor differ, so that no two scenes look alike.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Hidden element: a rough board in the deck, which stands out of it and stops the 
 leaves the deck falls into the tray behind it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -5,8 +5,6 @@ run-up is seen.
 Hidden element: the peg that stops the pointer, which may stand in any of the sectors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -5,8 +5,6 @@ Hidden element: the plunger, whose spring is lively or stuck fast in thick greas
 it drops down a step behind the occluder, so that what comes back stays there, and felt brings it to rest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial

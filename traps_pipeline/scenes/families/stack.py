@@ -5,8 +5,6 @@ Hidden element: the height of the stand. The pusher's plate passes just over the
 blocks that stand higher than the ledge are swept off and those below it stay.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

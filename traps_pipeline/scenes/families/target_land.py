@@ -5,8 +5,6 @@ Hidden element: the two parallel boards of the chute, which hang straight down o
 left or the right one. The throw is the same whichever way they slant, and the trays' walls keep the ball.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, radians, sin

@@ -6,8 +6,6 @@ Hidden element: a prop that stands right behind the pillar or off to its side, o
 same but is light or heavy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

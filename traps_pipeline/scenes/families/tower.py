@@ -5,8 +5,6 @@ Hidden element: a stop that stands in the ball's way or beside it, or a strip of
 the ball strikes the tower near its top, or never reaches it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

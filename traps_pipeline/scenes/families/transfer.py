@@ -5,8 +5,6 @@ Hidden element: the board between block and zone, which is slick or rough. The r
 that happens on the deck comes back out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from traps_pipeline.scenes.parts.course import SHADOW_BACK, Course, Surface

@@ -4,8 +4,6 @@ Control: until the dice lie still. Void: the clip ends while they tumble. Edges 
 no pixel shows; gravity is low, which nothing in view betrays, so that many tumbles come after a cut at one second.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

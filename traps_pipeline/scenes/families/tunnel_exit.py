@@ -5,8 +5,6 @@ the ramp is seen above it.
 Hidden element: the deflector in the fork, which is turned to lead the ball to the left or to the right.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -5,8 +5,6 @@ and the road beyond.
 Hidden element: a kerb under the bridge, which lies across the road or along its far edge.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Hidden element: a strip of the track before the mat that is slippery or rough, o
 beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

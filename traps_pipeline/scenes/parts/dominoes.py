@@ -5,8 +5,6 @@ occluder from the start and which two posts stop after it has struck the second 
 unless a name ends in `_m`; they run along the way from the first domino on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Assemble a family from its parts, for the registry."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

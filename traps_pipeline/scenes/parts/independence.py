@@ -4,8 +4,6 @@ The test runs over draws: the index of the drawn world among the scene's possibl
 order) must be independent of each parameter that they share, and of each two. How a family makes twins is irrelevant.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import combinations
 from typing import Any

@@ -4,8 +4,6 @@ A board stands from first frame to last before the scene, which is then never se
 bench tells it from a scene.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

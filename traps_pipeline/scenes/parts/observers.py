@@ -8,8 +8,6 @@ An observer with `ahead` is for frames that end before the outcome: it asks for 
 so many frames as it moved last.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ A template names parts in braces: '{ball}' is the value of the field `ball_colou
 has one `Question` and some answerable asides, of which each scenario has one; even the void answers those.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -4,8 +4,6 @@ A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the fu
 (F,), lengths in metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -14,8 +14,6 @@
 element that depends on nothing is as likely whatever is seen. `twins(p)` changes the hidden element.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, make_dataclass, replace
 from functools import cache

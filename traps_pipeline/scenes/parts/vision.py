@@ -4,8 +4,6 @@ Frames are RGB uint8, shape (360, 480, 3); pixel coordinates are x to the right,
 `kit.COLOURS`. A colour that is none of them (most occluders') belongs to no mask.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

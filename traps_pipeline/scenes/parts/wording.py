@@ -4,8 +4,6 @@ An ill-posed question is drawn from shared templates over the scene's inventory,
 that a question which a reviewer wrote is checked in the same way (docs/spec.md 2.4).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache

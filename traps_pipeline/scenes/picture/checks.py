@@ -1,7 +1,5 @@
 """Measure pixels: of a geom, past an occluder, between two worlds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 

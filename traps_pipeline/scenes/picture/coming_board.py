@@ -5,8 +5,6 @@ own board stands, in control and void alike: neither that a board comes nor when
 apart.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test whether this machine can draw a frame and encode a clip."""
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

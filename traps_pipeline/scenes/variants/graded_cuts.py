@@ -4,8 +4,6 @@ The void of a pair is cut where nobody can know, an arm where everybody should. 
 all that is between, and the certificate is the distribution over answers itself.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

@@ -5,8 +5,6 @@ varies the occluder is drawn and certified here. An occluder that lets the outco
 asked as one. Not every scenario admits every variation; `Rejected` says why.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

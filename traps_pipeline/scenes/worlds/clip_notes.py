@@ -1,7 +1,5 @@
 """Read and write clips, each with the note beside it that vouches for it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

@@ -4,8 +4,6 @@ Occluder: the void is the same replay with the occluder drawn. Truncation: the v
 board comes before a control that closes, and before its void if an occluder makes it; the twin's clip never has one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

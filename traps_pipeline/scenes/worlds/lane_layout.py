@@ -3,8 +3,6 @@
 Camera, benches and boards are fitted to each other and to both worlds of each lane, in no order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

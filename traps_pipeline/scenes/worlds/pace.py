@@ -4,8 +4,6 @@ Where the outcome settles early, void and control end earlier; where too late, t
 an occlusion pair count alike (docs/design/twins.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Let boards stand, come and go: by a timetable, and always for a window that shows what they stood before."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
