@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.build.inside import with_mechanism
-from tests.conftest import Checkout
+from tests.conftest import EXPERIMENT, Checkout
 from traps_pipeline.mechanism.control_rows import INTERACTION
 from traps_pipeline.mechanism.interaction import LaneDesign, figures_of
 from traps_pipeline.protocol.two_events import lane_items
@@ -54,18 +53,25 @@ def test_families_are_not_held_out_where_there_is_one() -> None:
 
 
 @pytest.mark.slow
-def test_traps_run_reads_two_events_in_a_model_and_in_its_random_weights(own_study: Checkout) -> None:
-    path = own_study.root / with_mechanism(own_study)
-    experiment = yaml.safe_load(path.read_text())
-    experiment["datasets"] += ["two_events"]
-    experiment["scenarios"] += ["domino_chain-e001", "slide-e001"]
-    experiment["mechanism"] |= {"prompts": ["standard", "guided"], "steering": None, "patching": None}
-    path.write_text(yaml.safe_dump(experiment))
-    own_study.traps("run", path.name, "--until", "interaction").ok()
-    rows = Workspace.open(own_study.workspace).tables.read_all(INTERACTION)
+def test_traps_run_reads_two_events_in_the_pocket_and_in_its_random_weights(own_study: Checkout) -> None:
+    experiment = yaml.safe_load((own_study.root / EXPERIMENT).read_text()) | {
+        "models": ["pocket"],
+        "regimes": ["guided"],
+        "judged_by_rules": True,
+        "datasets": ["chaotic", "chaotic_ill_posed", "two_events"],
+        "mechanism": {
+            "models": {"pocket": {"steering": 3, "centroid": 4}},
+            "probes": {"folds": 2, "resamples": 100},
+            "steering": None,
+        },
+    }
+    experiment["scenarios"] = ["domino_chain-e001", "slide-e001", "plinko-0001", "plinko-0002", "tumbling_dice-0001"]
+    (own_study.root / "inside.yaml").write_text(yaml.safe_dump(experiment))
+    workspace = own_study.root / "inside"
+    own_study.traps("run", "inside.yaml", "--workspace", workspace, "--until", "interaction").ok()
+    rows = Workspace.open(workspace).tables.read_all(INTERACTION)
     assert {*rows["prompt"]} == {"guided", "random_0", "random_1"}
     states, rivals = (rows.loc[rows["layer"].ge(0) == of_states] for of_states in (True, False))
     assert len(states) == 3 * 2 * 5 and {*states.loc[states["chosen"]].groupby(["prompt", "held_out"]).size()} == {1}
     assert {*rivals["features"]} == {"pixels", "words", "both added"}
     assert rivals[["auroc", "within"]].to_numpy() == pytest.approx(0.5)
-    assert rivals.loc[rivals["features"] == "pixels", "confound"].min() > 0.5  # a board is seen
