@@ -59,7 +59,7 @@ def _reads(arm: str, scenario_id: str) -> tuple[str | None, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", ["catch-0001", "tower-0001"])
+@pytest.mark.parametrize("scenario_id", ["bounce-0001", "slide-0001"])
 def test_the_observer_answers_after_a_late_occluder_from_what_was_seen_before(scenario_id: str) -> None:
     said, answer = _reads("late_occluder", scenario_id)
     assert said == answer
