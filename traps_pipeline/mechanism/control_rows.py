@@ -204,7 +204,11 @@ Chance = Annotated[float | None, "95 % interval, scenarios resampled, probes hel
 class InteractionRow(JoinedColumns):
     """Whether features tell, of clips of two events, that the asked one is hidden; chance is 0.5."""
 
-    features: Annotated[str, "states; or a rival, 0.5 by design: pixels, words, or both added"]
+    features: Annotated[
+        str,
+        "states; or a rival: pixels, words, both added and length are at 0.5 by design, output margin and first-token "
+        "logits (with a probe) are what the model says",
+    ]
     layer: Annotated[int, "of the states; -1 for rivals"]
     held_out: Annotated[str, "what probes have not seen: scenarios or families"]
     chosen: Annotated[bool, "whether it is the layer at which pairs of other datasets transfer best, or a rival"]
@@ -214,6 +218,7 @@ class InteractionRow(JoinedColumns):
     within: Annotated[float, "share of these clips whose hidden event's question is scored above the other one"]
     within_low: Chance
     within_high: Chance
+    ties: Annotated[float, "share of these clips with one score under both questions; 1: features do not vary"]
     confound: Annotated[float, "AUROC of the same probe over all eight items: the number of boards tells; no claim"]
     own_effect: Annotated[float, "rise of the score from no event hidden to the asked one alone, in its deviations"]
     other_effect: Annotated[float, "the same to the other one alone"]

@@ -40,6 +40,7 @@ from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.study import ProbeSettings
 
 MAX_WORKERS = 4
+MARKING = 2  # of `mark_layers`; raise it if a flag may differ, so that rows are made again
 Result = TypeVar("Result")
 Row = dict[str, Any]
 ReadLayer = Callable[[str, int], np.ndarray]  # dataset, layer -> states (n, d) in the order of the dataset's items

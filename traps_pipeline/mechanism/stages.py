@@ -31,7 +31,13 @@ from traps_pipeline.mechanism.mechanism_rows import (
     ProbeRow,
 )
 from traps_pipeline.mechanism.probe_items import other_clip
-from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.probing import (
+    MARKING,
+    Confabulated,
+    NothingConfabulated,
+    ProbeRun,
+    confabulated_scenarios,
+)
 from traps_pipeline.mechanism.probing_versions import mechanism_entry, states_folder
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import CURVES
@@ -76,7 +82,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     assert entry.media is not None, "local entries have media"
     items = workspace.tables.read(PROBE_ITEMS, {"dataset": cell.dataset}).to_dict("records")
     model = load_local_model(entry, inside=True, seed=cell.extraction.weights_seed)
-    system = states_prompt(settings.system, cell.extraction.text)
+    system = states_prompt(settings.system, cell.text)
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
     asked_of = [
@@ -157,7 +163,7 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
             states.digest,
             {name: sorted(scenarios) for name, scenarios in confabulated.scenarios.items()},
             dict(confabulated.problems),
-            [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed, CURVES],
+            [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed, CURVES, MARKING],
         ]
     )[:16]
     known_rows = _known_rows(workspace, extraction, made_of)

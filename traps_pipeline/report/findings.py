@@ -11,7 +11,8 @@ from traps_pipeline.mechanism.control_rows import MODEL, STATES
 from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.claims import CLAIMS, claim_frame, lead_rows
+from traps_pipeline.report.tables.claims import CLAIMS, claim_frame
+from traps_pipeline.report.tables.control_reports import lead_rows
 
 if TYPE_CHECKING:
     import pandas as pd
