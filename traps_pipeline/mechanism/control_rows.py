@@ -102,7 +102,6 @@ class ProbeBaselineRow(ExtractionColumns):
     spread: Annotated[float | None, "of noise: standard deviation over draws"]
     n_voids: Annotated[int, "void items of the target"]
     n_controls: Annotated[int, "control items of the target"]
-    note: Annotated[str | None, "why there is no figure"]
 
 
 PROBE_BASELINES = Table(
@@ -242,7 +241,6 @@ class ItemScoreRow(JoinedColumns):
     scenario_id: shared.ScenarioId
     side: shared.Side
     layer: Annotated[int, "at which the dataset is read, chosen on pairs of other datasets"]
-    own: Annotated[float | None, f"{UNSEEN} and was fitted on the item's own dataset"]
     others: Annotated[float | None, f"{UNSEEN} and was fitted on the other datasets"]
     margin: Annotated[float | None, "log-odds that the first answer token begins an abstention, under this prompt"]
     abstained_standard: Annotated[bool | None, "verdict of run 1 under standard; null if undecided or not asked"]

@@ -40,7 +40,6 @@ from traps_pipeline.scoring.bootstrap import scenario_weights
 from traps_pipeline.storage.study import ProbeSettings
 
 MAX_WORKERS = 4
-MARKING = 2  # of `mark_layers`; raise it if a flag may differ, so that rows are made again
 Result = TypeVar("Result")
 Row = dict[str, Any]
 ReadLayer = Callable[[str, int], np.ndarray]  # dataset, layer -> states (n, d) in the order of the dataset's items
@@ -291,7 +290,7 @@ class ProbeRun:
         """Return shares of items that the source's nearest centroid assigns to void.
 
         The centroids of a taxonomy's two datasets come from the same controls, so these shares are too low for
-        controls; `baselines` has the same of noise.
+        controls.
         """
         splits, rows = splits or {name: self._split(name, layer) for name in self._own}, []
         for source, target in self._pairs:

@@ -121,12 +121,13 @@ class Results:
     corrected = table_frame(CORRECTED)
     composition = own("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
     prompted_probes = table_frame(PROBES)  # under every prompt
-    prompted_baselines = table_frame(PROBE_BASELINES)  # under every prompt
     # PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.
-    probes = cached_property(lambda results: _probe_prompt_rows(results.prompted_probes))
+    probes = cached_property(
+        lambda results: results.prompted_probes.loc[results.prompted_probes["prompt"] == PROBE_PROMPT]
+    )
     cosines = own("COSINES rows at the steered layer of each model.")
     effects = own("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
-    baselines = cached_property(lambda results: _probe_prompt_rows(results.prompted_baselines))
+    baselines = table_frame(PROBE_BASELINES)  # under PROBE_PROMPT alone
     gate = table_frame(GATE)
     patching = table_frame(PATCHING)
     nulls = table_frame(STEERING_NULLS)
@@ -168,10 +169,6 @@ class Results:
         return "; ".join(self.refused.get(what, [])) or (
             "this study has no such results yet" if self.is_study else "the paper prints no such table"
         )
-
-
-def _probe_prompt_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows.loc[rows["prompt"] == PROBE_PROMPT]
 
 
 def datasets_of(cells: pd.DataFrame) -> list[str]:

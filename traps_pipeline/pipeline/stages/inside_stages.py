@@ -86,10 +86,10 @@ def _is_trained(_: StudyPartitions, key: str) -> bool:
 
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
-    code="3",
+    code="4",
     parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
-    wants=lambda study, key: _is_trained(study, key) and Extraction.parse(key).prompt in study.probed_prompts,
+    wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return probes on raw inputs, the output margin and noise instead of states."""

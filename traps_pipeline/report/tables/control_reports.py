@@ -59,21 +59,10 @@ def _nulls(results: Results) -> PrintedTable:
         "effect: more abstention on controls (+), less on voids (−), against the unsteered answers of the same items",
         "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
         "(1 + draws), one-sided, not corrected for the number of rows",
-        *_extent_beyond_nulls(rows),
         *few_note(table_rows),
     ]
     reason = why(results, "the paper has no such nulls")
     return PrintedTable("steering_nulls", "Void directions among their nulls", table_rows, columns, notes, reason)
-
-
-def _extent_beyond_nulls(rows: pd.DataFrame) -> list[str]:
-    """Return where the void direction exceeds at least 95 % of its nulls, in words."""
-    targets = rows.loc[rows["target"] != "all"]
-    if targets.empty:
-        return []
-    count = int((20 * targets["n_at_least"] <= targets["draws"]).sum())
-    extent = f"in {count} of {len(targets)} rows" if count else "nowhere"
-    return [f"the void direction is ahead of 19 of 20 draws {extent}; one row in ten would be so by chance"]
 
 
 MODEL_OF = ("model", "directions", "regime")
@@ -180,11 +169,12 @@ def prompts(results: Results) -> pd.DataFrame:
     shares = shares.reindex(columns=pd.Index(PROMPTING))
     table = (shares["guided"] - shares["standard"]).to_frame("change")
     probes = results.prompted_probes.loc[results.prompted_probes["chosen"].eq(True)]
-    margins = results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]
+    probes = probes.loc[(probes["analysis"] == "held_out") & (probes["source"] == probes["target"])]
+    probes = probes.rename(columns={"target": "dataset", "value": "auroc"})
+    margins = results.lens.loc[results.lens["layer"] == results.lens.groupby("model")["layer"].transform("max")]
     for name, rows in (("probe", probes), ("margin", margins)):
-        rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
-        rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
-        by_prompt = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
+        rows = rows.astype({"prompt": object, "dataset": object, "auroc": float})
+        by_prompt = rows.pivot_table(index=keys, columns="prompt", values="auroc", observed=True)
         table = table.join(by_prompt.reindex(columns=pd.Index(PROMPTING)).add_prefix(f"{name}_"))
     return table.reset_index()
 
