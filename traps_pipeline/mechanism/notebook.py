@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel, Prompt
 
 AnyLayer = int | Literal["normed"]
-SYSTEMS = ("vqa", "benchmark")
 Where = str | Path | Workspace
 ABSTENTION = "I don't know: this cannot be determined from the video."
 Threshold = Literal["mid", "J", "conformal"]
@@ -129,7 +128,7 @@ def prompt(
     """
     opened, entry = _examined(workspace, model)
     check_name("prompt", regime, VQA_PROMPTS)
-    check_name("system", system or "vqa", SYSTEMS)
+    check_name("system", system or "vqa", ("vqa", "benchmark"))
     probed = [str(part["dataset"]) for part in opened.tables.partitions(PROBE_ITEMS)]
     check_name("dataset", dataset_of(item), probed)
     items = opened.tables.read(PROBE_ITEMS, {"dataset": dataset_of(item)}).set_index("item_id")
