@@ -15,7 +15,7 @@ from traps_pipeline.mechanism.gate import (
     OTHER_FAMILIES,
     Items,
     Outcomes,
-    decide,
+    gate_answers,
     thresholds,
 )
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
@@ -81,10 +81,10 @@ SETTINGS = {"folds": 3, "seed": 1, "false_abs": 0.05}
 def test_a_gate_depends_on_no_label_of_a_scenario_that_it_decides_about(source: str) -> None:
     """Changing the sides of one scenario in every dataset leaves its own scores as they are, bit for bit."""
     items, _ = study()
-    before = decide(items, source, "chaotic", **SETTINGS)
+    before = gate_answers(items, source, "chaotic", **SETTINGS)
     mine = (items.table["scenario_id"] == "chaotic-04").to_numpy()
     changed = items.table.assign(void=np.where(mine, ~items.void, items.void))
-    after = decide(Items(changed, items.features), source, "chaotic", **SETTINGS)
+    after = gate_answers(Items(changed, items.features), source, "chaotic", **SETTINGS)
     own = mine[before.place]
     assert own.sum() == 2 and (before.score[own] == after.score[own]).all()
     assert all((before.threshold[name][own] == after.threshold[name][own]).all() for name in before.threshold)
@@ -94,22 +94,22 @@ def test_a_gate_depends_on_no_label_of_a_scenario_that_it_decides_about(source: 
 
 def test_a_gate_that_leaves_families_out_sees_no_label_of_the_family() -> None:
     items, _ = study()
-    before = decide(items, OTHER_FAMILIES, "occlusion", **SETTINGS)
+    before = gate_answers(items, OTHER_FAMILIES, "occlusion", **SETTINGS)
     family = (items.table["family"] == "occlusion:1").to_numpy()
     changed = Items(items.table.assign(void=np.where(family, ~items.void, items.void)), items.features)
-    after = decide(changed, OTHER_FAMILIES, "occlusion", **SETTINGS)
+    after = gate_answers(changed, OTHER_FAMILIES, "occlusion", **SETTINGS)
     own = family[before.place]
     assert own.sum() == 8 and (before.score[own] == after.score[own]).all()
 
 
 def test_a_planted_signal_is_gated_and_shuffled_labels_are_not() -> None:
     items, coins = study()
-    found = decide(items, OTHER_DATASETS, "chaotic", **SETTINGS)
+    found = gate_answers(items, OTHER_DATASETS, "chaotic", **SETTINGS)
     void = items.void[found.place]
     gate = found.score > found.threshold["J"]
     assert gate[void].mean() > 0.9 and gate[~void].mean() < 0.25
     conformal = found.score > found.threshold["conformal"]
     assert conformal[~void].mean() < 0.35 and np.isfinite(found.threshold["conformal"]).all()
-    noise = decide(Items(items.table.assign(void=coins), items.features), OTHER_DATASETS, "chaotic", **SETTINGS)
+    noise = gate_answers(Items(items.table.assign(void=coins), items.features), OTHER_DATASETS, "chaotic", **SETTINGS)
     loose = noise.score > noise.threshold["mid"]
     assert abs(loose[void].mean() - loose[~void].mean()) < 0.6

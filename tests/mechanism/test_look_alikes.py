@@ -22,7 +22,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import MARGIN, output_features
 from traps_pipeline.mechanism.control_rows import MODEL, RESIDUAL, STATES, GateRow
-from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS, decide
+from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS, gate_answers
 from traps_pipeline.mechanism.gating import gate_items, gate_rows, gate_table, read_states
 from traps_pipeline.mechanism.item_scores import item_score_rows
 from traps_pipeline.mechanism.leads import lead_rows, nuisance_components, placed, residual
@@ -213,7 +213,7 @@ def test_every_subject_has_states_and_rivals_by_probes_that_saw_neither_dataset_
     table, layer = gate_table(StoredStates.of(study, STANDARD)), int(own["layer"])
     features = read_states(StoredStates.of(study, STANDARD), EVERY, layer)
     items, folds = gate_items(table, features, shuffled=False, seed=0), study.mechanism.probes.folds
-    decisions = decide(items, OTHER_DATASETS, "chaotic", folds=folds, seed=study.mechanism.seed, false_abs=0.05)
+    decisions = gate_answers(items, OTHER_DATASETS, "chaotic", folds=folds, seed=study.mechanism.seed, false_abs=0.05)
     void = table.loc[table["dataset"] == "chaotic", "void"].to_numpy(bool)
     assert own["auroc"] == pytest.approx(float(auroc(void, decisions.score)))
 
@@ -288,7 +288,7 @@ def test_every_item_has_a_score_of_states_a_margin_and_its_verdict(study: Worksp
         assert of["margin"].to_numpy(float) == pytest.approx(margins)
         (layer,) = {*of["layer"]}
         table, features = gate_table(states), read_states(states, EVERY, layer)
-        own = decide(gate_items(table, features, shuffled=False, seed=0), f"one:{dataset}", str(dataset),
+        own = gate_answers(gate_items(table, features, shuffled=False, seed=0), f"one:{dataset}", str(dataset),
                      folds=study.mechanism.probes.folds, seed=study.mechanism.seed, false_abs=0.05)  # fmt: skip
         assert of["own"].to_numpy(float) == pytest.approx(own.score - own.threshold["mid"])
 

@@ -21,7 +21,7 @@ from tests.providers.server import Provider
 from traps_pipeline.base.archives import pack as zipped
 from traps_pipeline.base.archives import unpack
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.judging.verdicts import verdicts_of
 from traps_pipeline.models.registry.judges import BY_RULES, RULES_VERSION
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
@@ -63,7 +63,7 @@ def forged(
     if rescore:
         items, answers, votes = (frames[f"{name}.parquet"] for name in ("items", "responses", "votes"))
         own = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
-        scored = score(decide(items[own], answers.drop(columns="benchmark_version"), votes))
+        scored = score(verdicts_of(items[own], answers.drop(columns="benchmark_version"), votes))
         tables = {"metrics": scored.metrics, "leaderboard": scored.board, "two_way": scored.two_way}
         frames |= {f"{name}.parquet": frame for name, frame in tables.items()}
     content = {name: table_bytes(TABLES[name], frame) for name, frame in frames.items()}

@@ -47,7 +47,7 @@ def is_reviewed(decisions: Sequence[Correction]) -> bool:
     return bool(decisions) and decisions[-1].action != "restore"
 
 
-def decide(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> None:
+def save_decision(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> None:
     """Append a decision.
 
     n_seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
@@ -58,10 +58,10 @@ def decide(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> N
         append([correction])
 
 
-def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
+def undo_decision(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
     """Append decisions that take back the last one about a scenario.
 
-    Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
+    Raises DecidedMeanwhile as `save_decision` does, and TrapsError if there is no decision to take back.
     """
     with _open_for_append(folder) as append:
         decisions = _require_known(scenario_id, n_seen, folder)

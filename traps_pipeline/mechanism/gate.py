@@ -96,7 +96,7 @@ def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS
     return [name for name in datasets if source in (OTHER_FAMILIES, f"one:{name}")]
 
 
-def decide(items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float) -> Decisions:
+def gate_answers(items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float) -> Decisions:
     """Return the decisions of a source's gates about every item of a dataset.
 
     A gate is fitted for each fold of the target's scenarios (each family, for `other families`) on source items of all
@@ -119,7 +119,7 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
 
 
 def unseen_scores(items: Items, source: str, target: str, folds: int, seed: int) -> np.ndarray:
-    """Return the log-odds (n,) of a dataset's items by the probes of `decide`, without thresholds."""
+    """Return the log-odds (n,) of a dataset's items by the probes of `gate_answers`, without thresholds."""
     target_features = items.features[items.table["dataset"].to_numpy(str) == target]
     score = np.full(len(target_features), np.nan)
     for is_in_fold, is_training in _each_fold(items, source, target, folds, seed):

@@ -20,8 +20,8 @@ from traps_pipeline.mechanism.gate import (
     Decisions,
     Items,
     Outcomes,
-    decide,
     families,
+    gate_answers,
     separation,
     sources_of_gate,
 )
@@ -139,7 +139,7 @@ def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates) -> Gated
         if not sources_of_gate(source, str(target), datasets):
             continue  # a study without all datasets has fewer gates
         layer = gates.layers.get(str(target), -1)
-        decision = decide(items_of[layer], source, str(target), **settings_of_gate)
+        decision = gate_answers(items_of[layer], source, str(target), **settings_of_gate)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer
     return decisions

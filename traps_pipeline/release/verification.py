@@ -22,7 +22,7 @@ from traps_pipeline.benchmark.items import commonest_answers, item_hash
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
 from traps_pipeline.judging.rules import RuleJudge
-from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.judging.verdicts import verdicts_of
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.reading.interpret import degenerate, read_answer
 from traps_pipeline.models.reading.judged_answers import is_correct
@@ -344,7 +344,7 @@ def _numbers(verified: Verification, submission: Submission) -> None:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
         items, answers, votes = tables
         columns = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
-        verdicts = decide(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
+        verdicts = verdicts_of(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
             {"panel": panel}
         )
         verified.verdicts, verified.scored = verdicts, score(verdicts)

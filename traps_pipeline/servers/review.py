@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import explain
 from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
-from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
+from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decisions_on, is_reviewed, save_decision, undo_decision
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
@@ -133,7 +133,7 @@ class Review:
             new = {"scenario_id": self._free_id(spec["family"]), "family": spec["family"], "params": params}
             correction, decision_count = correction.model_copy(update=new), 0
         try:
-            decide(correction, decision_count)
+            save_decision(correction, decision_count)
         except DecidedMeanwhile as error:
             raise Conflict(str(error)) from error
 
@@ -146,7 +146,7 @@ class Review:
         """Take back the last decision. Raises NotFound, Refused and Conflict."""
         self.spec(sent.scenario_id)
         try:
-            undo(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
+            undo_decision(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
         except DecidedMeanwhile as error:
             raise Conflict(str(error)) from error
 
