@@ -19,7 +19,7 @@ import numpy as np
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
+from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, sent_bodies
 from traps_pipeline.checks.wire_body import (
     ENDPOINTS,
     SCHEMAS,
@@ -208,7 +208,7 @@ def examine(entry: Entry) -> CheckedEntry:
 
 def _examine_network(entry: Entry) -> CheckedEntry:
     requests = requests_of(entry)
-    bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
+    bodies = dict(zip(requests, sent_bodies(entry, list(requests.values())), strict=True))
     problems: dict[str, list[str]] = {}
     for form, body in bodies.items():
         messages = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)

@@ -77,7 +77,7 @@ def quote(noun: str, name: str, text: str, most: int = MAX_SHOWN) -> str:
     )
 
 
-def render(task: Task, question: str, answer: str, ground_truth: str | None) -> str:
+def vote_text(task: Task, question: str, answer: str, ground_truth: str | None) -> str:
     """Return the user message to a judge."""
     parts = [f"Question: {question}"]
     if task == "correctness":
@@ -109,10 +109,8 @@ def vote_requests(
     judges: Sequence[Judge], task: Task, cell: Cell, item: Mapping[str, Any], answer: str
 ) -> list[Request]:
     """Return each judge's call for one task about one answer, with the same text."""
-    user, subject = (
-        render(task, item["question"], answer, item["ground_truth"]),
-        vote_subject(task, cell, item["item_id"]),
-    )
+    user = vote_text(task, item["question"], answer, item["ground_truth"])
+    subject = vote_subject(task, cell, item["item_id"])
     return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), subject, user) for judge in judges]
 
 

@@ -21,7 +21,7 @@ from traps_pipeline.benchmark.records import load_released, released_lines, two_
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.models.registry.entries import load_accounts, load_models
 from traps_pipeline.models.registry.judges import load_judges, load_panel
-from traps_pipeline.models.registry.prompts import prompt, system_prompt, vqa_prompt
+from traps_pipeline.models.registry.prompts import load_prompt, system_prompt, vqa_prompt
 from traps_pipeline.pipeline.assets import WorkspaceResource
 from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History
@@ -61,7 +61,7 @@ def reread_sources() -> None:
     """
     registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
     benchmark = (load_released, released_lines, two_events_lines, corrected_scenarios, corrected_two_events)
-    for reader in (*benchmark, prompt, system_prompt, vqa_prompt, *registries):
+    for reader in (*benchmark, load_prompt, system_prompt, vqa_prompt, *registries):
         reader.cache_clear()
 
 

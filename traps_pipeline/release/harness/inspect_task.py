@@ -11,7 +11,7 @@ from inspect_ai.model import ChatMessageSystem, ChatMessageUser, ContentImage, C
 from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 
-from traps_pipeline.release.harness.harness_items import about, items, media_of, prompt
+from traps_pipeline.release.harness.harness_items import about, harness_prompt, items, media_of
 from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
 
 _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
@@ -25,7 +25,7 @@ def traps(regime: str = "standard") -> Any:
 
 def evaluation(regime: str) -> Any:
     """Return a task with all items under a regime, once; each run is an evaluation."""
-    system = prompt(regime)
+    system = harness_prompt(regime)
     samples = [
         Sample(
             id=item["item_id"],

@@ -11,7 +11,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # lmms-eval loads this file alone, from any folder
 
-from traps_pipeline.release.harness.harness_items import media_of, prompt
+from traps_pipeline.release.harness.harness_items import harness_prompt, media_of
 from traps_pipeline.release.harness.scoring import RUN_FIGURES, TWO_WAY_FIGURES, PanelDecision, figures, judge
 
 
@@ -32,7 +32,7 @@ def doc_to_target(doc: dict[str, Any]) -> str:
 
 def _text(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> str:
     """Return system prompt and question as one text, for models without the former."""
-    return f"{prompt(regime)}\n\n{doc['question']}"
+    return f"{harness_prompt(regime)}\n\n{doc['question']}"
 
 
 def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> list[dict[str, Any]]:
@@ -41,7 +41,7 @@ def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, reg
     kind = "video" if isinstance(visuals[0], str) else "image"
     content = [{"type": kind, "url": visual} for visual in visuals]
     return [
-        {"role": "system", "content": [{"type": "text", "text": prompt(regime)}]},
+        {"role": "system", "content": [{"type": "text", "text": harness_prompt(regime)}]},
         {"role": "user", "content": [*content, {"type": "text", "text": doc["question"]}]},
     ]
 
