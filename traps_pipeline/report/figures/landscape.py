@@ -11,7 +11,7 @@ import numpy as np
 from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
-from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
+from traps_pipeline.report.figures.looks import arrow, frame_plane, legend_key, looks, model_family
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
@@ -147,7 +147,7 @@ def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
 
 
 def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
-    families = guided["model"].map(family_of)
+    families = guided["model"].map(model_family)
     for _, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
         best = rows.loc[rows["pecs"].idxmax()]
         if best["pecs"] > 0:
