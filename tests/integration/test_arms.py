@@ -27,7 +27,7 @@ from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.harness.scoring import TWO_WAY_FIGURES, figures, judge
 from traps_pipeline.release.harness.write import write_harness
-from traps_pipeline.release.submission import pack, read_submission
+from traps_pipeline.release.submission import pack_submission, read_submission
 from traps_pipeline.release.submissions import gather
 from traps_pipeline.release.verification import released_items, verify
 from traps_pipeline.report.explorer.site import write_site
@@ -165,7 +165,7 @@ def test_two_events_are_released_submitted_and_scored_by_others(
     assert {*lanes} == {item.item_id for item in lane_items(spec.scenario_id)}
     assert all((released / "clips" / row["file_name"]).is_file() for row in lanes.values())
 
-    pack(workspace, tmp_path / "mine.zip", "mine")
+    pack_submission(workspace, tmp_path / "mine.zip", "mine")
     submission = read_submission(tmp_path / "mine.zip")
     assert verify(submission, released_items(released)).problems == []
     board = gather([tmp_path / "mine.zip"], released).groups[0]

@@ -168,9 +168,9 @@ def harness(arguments: argparse.Namespace) -> int:
 
 
 def submit(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.release.submission import pack
+    from traps_pipeline.release.submission import pack_submission
 
-    description = pack(open_workspace(arguments), arguments.file.absolute(), arguments.name)
+    description = pack_submission(open_workspace(arguments), arguments.file.absolute(), arguments.name)
     size = arguments.file.stat().st_size / 1e6
     contents_text = f"benchmark {description.benchmark} {description.version}, panel {description.panel}"
     print(f"{arguments.file}: {description.name}, {contents_text}, {size:.1f} MB")

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.base.archives import BadArchive, reading_archive
-from traps_pipeline.base.archives import pack as pack_archive
+from traps_pipeline.base.archives import zip_bytes as pack_archive
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.names import Name
@@ -101,7 +101,7 @@ class Submission:
 # --- packing ----------------------------------------------------------------------------------------------------------
 
 
-def pack(workspace: Workspace, target: Path, name: str) -> About:
+def pack_submission(workspace: Workspace, target: Path, name: str) -> About:
     """Write a study's submission, equal bytes for equal studies. Raises TrapsError unless it is judged and scored."""
     begin_publication(workspace.root, "a submission")
     study = workspace.study

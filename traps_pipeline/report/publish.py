@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.base.archives import pack
+from traps_pipeline.base.archives import zip_bytes
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.held_out import begin_publication
@@ -138,7 +138,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
         else:
             write_bytes(target / path, content)
     index = _index(paths).encode()
-    write_bytes(*((target, pack(members | {INDEX: index}, level=6)) if is_zip else (target / INDEX, index)))
+    write_bytes(*((target, zip_bytes(members | {INDEX: index}, level=6)) if is_zip else (target / INDEX, index)))
     return len(paths) + 1
 
 

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from traps_pipeline.base.archives import BadArchive, pack, unpack
+from traps_pipeline.base.archives import BadArchive, unzip_bytes, zip_bytes
 from traps_pipeline.base.bounded_cache import BoundedCache
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -244,7 +244,7 @@ def payload(media: Media) -> list[bytes]:
         raise TrapsError("media.profile frames is not sent as bytes; use video or images for a model behind an API")
     try:
         data = media.path.read_bytes()
-        parts = [*unpack(data).values()] if media.profile == "images" else [data]
+        parts = [*unzip_bytes(data).values()] if media.profile == "images" else [data]
     except OSError as error:
         raise _damaged_clip(media.path, error.strerror or str(error)) from error
     except BadArchive as error:
@@ -283,7 +283,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = file_digest(path), path.stat().st_size
     else:
         jpegs = [_jpeg(frame) for frame in frames.frames]
-        data = pack({f"{i:02d}.jpg": jpeg for i, jpeg in enumerate(jpegs)})
+        data = zip_bytes({f"{i:02d}.jpg": jpeg for i, jpeg in enumerate(jpegs)})
         write_bytes(path, data)
         sha256, size = _sha256(jpegs), len(data)
     times = tuple(frames.times_s.tolist())
