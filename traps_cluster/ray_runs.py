@@ -31,7 +31,7 @@ from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.entries import LOCAL, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.metadata import tally_of
-from traps_pipeline.pipeline.ranges import Range, cut, shared_out
+from traps_pipeline.pipeline.ranges import Range, cut_keys, shared_out
 from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, keys_of, problems_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, UNWANTED
 from traps_pipeline.protocol.cells import Cell
@@ -144,7 +144,7 @@ class RayRuns(Runs):
         scheme = stages[0].scheme if stages else None
         shared = [stage.shared for stage in stages if stage.shared is not None]
         if not shared:
-            return cut(scheme, keys, self._most)
+            return cut_keys(scheme, keys, self._most)
         seconds = {key: sum(each.seconds(self._workspace, key) for each in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
 

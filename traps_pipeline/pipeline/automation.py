@@ -28,7 +28,7 @@ from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.machine import require_machine
 from traps_pipeline.pipeline.metadata import errors_for_pages, page_text, visible_metadata
 from traps_pipeline.pipeline.partition_checks import CURRENT
-from traps_pipeline.pipeline.ranges import batches
+from traps_pipeline.pipeline.ranges import key_ranges
 from traps_pipeline.pipeline.run import materialize_stale
 from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.pipeline.runs import LocalRuns, range_tags, report_canceling
@@ -161,7 +161,7 @@ def _requests(instance: dg.DagsterInstance, plan: RunPlan) -> list[dg.RunRequest
         nodes = [(stage.name, key) for stage in stages for key in keys]
         # Try each outdated partition once per set of inputs: if it stays outdated, it fails for its own reasons.
         states = [[name_of(node), plan.lineage.made_at(*node), plan.lineage.inputs(*node)] for node in nodes]
-        for batch in batches(block[0].scheme, keys):
+        for batch in key_ranges(block[0].scheme, keys):
             requests.append(
                 dg.RunRequest(
                     digest([*batch, states])[:32],
