@@ -249,7 +249,7 @@ def parse_yaml_model(
         instance = model.model_validate(data, context=context)
     except ValidationError as error:
         place = place_of(path, error.errors()[0]["loc"], entry)
-        raise TrapsError(f"{place}{where and ': ' + where}: {explain(error, model, also)}") from error
+        raise TrapsError(f"{place}{where and ': ' + where}: {faults_of(error, model, also)}") from error
     for field in _converted_values(data, instance):
         place = place_of(path, field.partition(":")[0].split("."), entry)
         raise TrapsError(f"{place}{where and ': ' + where}: {field}")
@@ -275,7 +275,7 @@ def _converted_values(data: Any, validated: Any, name: str = "") -> Iterator[str
         yield from _converted_values(raw, value, f"{name}.{key}" if name else str(key))
 
 
-def explain(error: ValidationError, model: type[BaseModel] | None = None, also: Sequence[str] = ()) -> str:
+def faults_of(error: ValidationError, model: type[BaseModel] | None = None, also: Sequence[str] = ()) -> str:
     """Return a validation error as `field: complaint`, with the nearest field of the model or of `also`."""
     parts = list[str]()
     for details in error.errors():

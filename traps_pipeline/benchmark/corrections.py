@@ -27,7 +27,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.yamlfile import explain, read_lines
+from traps_pipeline.base.yamlfile import faults_of, read_lines
 from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines, two_events_lines
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names, get_family
@@ -137,7 +137,9 @@ class LaneScenario:
         try:
             return type(self.record.spec).model_validate(self.record.spec.model_dump(mode="json") | dict(self.words))
         except ValidationError as error:
-            raise TrapsError(f"{self.where}: {self.record.scenario_id}: {explain(error)}; correct that line") from error
+            raise TrapsError(
+                f"{self.where}: {self.record.scenario_id}: {faults_of(error)}; correct that line"
+            ) from error
 
 
 def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
@@ -151,7 +153,7 @@ def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneS
     try:
         return SceneSpec.model_validate(record)
     except ValidationError as error:
-        raise TrapsError(f"{where}: {spec.scenario_id}: {explain(error)}; correct that line") from error
+        raise TrapsError(f"{where}: {spec.scenario_id}: {faults_of(error)}; correct that line") from error
 
 
 def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]:
@@ -164,7 +166,7 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
                 corrections.append((location, Correction.model_validate(json.loads(line))))
             except ValidationError as error:
                 raise TrapsError(
-                    f"{location}: not a valid correction ({explain(error, Correction)}); correct that line"
+                    f"{location}: not a valid correction ({faults_of(error, Correction)}); correct that line"
                 ) from error
             except ValueError as error:
                 raise TrapsError(f"{location}: not JSON ({error}); correct that line") from error

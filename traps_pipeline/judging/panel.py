@@ -16,7 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, StrictBool, Validat
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.judging.judging_rows import VoteRow
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.asking.answers import answer_request, asked_items
@@ -200,7 +200,7 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
             return "it begins with an object that the answer holds, and goes on in prose"
         judgement = schema.model_validate_json(answer)
     except ValidationError as error:
-        return explain(error)[:200]
+        return faults_of(error)[:200]
     return judgement if read_object(answer) is not None else "a key stands twice"
 
 

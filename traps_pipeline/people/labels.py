@@ -16,7 +16,7 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, create_model
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.models.reading.judged_answers import is_correct
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
@@ -84,7 +84,7 @@ def label_lines(folder: Path) -> list[Line]:
             label = Line.model_validate_json(line.content)
             LABELS[label.task].model_validate(label.label)
         except ValidationError as error:
-            raise TrapsError(f"{path}:{line.number}: {explain(error)}") from error
+            raise TrapsError(f"{path}:{line.number}: {faults_of(error)}") from error
         lines.append(label)
     return lines
 

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import TOKEN_OWNER
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.people.judge_validation import sheet_rows
 from traps_pipeline.people.label_units import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
@@ -134,7 +134,7 @@ class Annotation:
         try:
             label = LABELS[task].model_validate(sent.label)
         except ValidationError as error:
-            raise Refused(explain(error)) from error
+            raise Refused(faults_of(error)) from error
         try:
             self.store.record(who, task, unit, label.model_dump())
         except NotWaiting as error:

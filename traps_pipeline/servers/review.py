@@ -15,7 +15,7 @@ from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Resp
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
 from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decisions_on, is_reviewed, save_decision, undo_decision
 from traps_pipeline.benchmark.records import load_released
@@ -165,7 +165,7 @@ class Review:
         try:
             return Correction.model_validate({**fields, "who": self.who, "when": date.today()})
         except ValidationError as error:
-            raise Refused(f"{scenario_id}: {explain(error)}") from error
+            raise Refused(f"{scenario_id}: {faults_of(error)}") from error
 
     def summary(self) -> CorrectionEffect:
         """Return the effect of the decisions that the study's tables do not contain yet."""

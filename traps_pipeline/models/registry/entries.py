@@ -17,7 +17,7 @@ from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.plugins import Group, require_known, versioned
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
+from traps_pipeline.base.yamlfile import faults_of, parse_yaml_model, read_yaml
 from traps_pipeline.models.reading.thinking import Marks, marks_of
 from traps_pipeline.models.registry import user_registry
 from traps_pipeline.models.registry.accounts import Account, Groups, Limits, Prices
@@ -199,7 +199,7 @@ class ModelEntry(Entry):
             try:
                 self.local_params()
             except ValidationError as error:
-                raise ValueError(f"params: {explain(error)}") from error
+                raise ValueError(f"params: {faults_of(error)}") from error
         elif (self.device, self.mechanism, self.size) != (None, None, None):
             raise ValueError("device, mechanism, size: only backend local has them")
 

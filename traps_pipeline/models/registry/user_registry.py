@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.network import is_loopback
-from traps_pipeline.base.yamlfile import explain, read_yaml
+from traps_pipeline.base.yamlfile import faults_of, read_yaml
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
 
 FILE = "own.yaml"
@@ -141,7 +141,7 @@ def _read(path: Path) -> UserRegistry:
     try:
         return UserRegistry.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        raise TrapsError(f"{path}: {explain(error, UserRegistry)}") from error
+        raise TrapsError(f"{path}: {faults_of(error, UserRegistry)}") from error
 
 
 def _yaml(registry: UserRegistry) -> str:
