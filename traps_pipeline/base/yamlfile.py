@@ -128,10 +128,10 @@ def name_file_in_errors(path: Path) -> Iterator[None]:
         if text.startswith(f"{path}:"):
             raise
         word = _QUOTED.search(text)
-        raise TrapsError(f"{place_of(path, [], word[1] if word else '')}: {text}") from error
+        raise TrapsError(f"{location_of(path, [], word[1] if word else '')}: {text}") from error
 
 
-def place_of(path: Path, keys: Sequence[int | str], word: str = "") -> str:
+def location_of(path: Path, keys: Sequence[int | str], word: str = "") -> str:
     """Return `file:line` of the value below these keys, as far as they are there, or only the file.
 
     word: the value of a scalar, or the name or `id` of a mapping, somewhere in the file; the keys begin there.
@@ -248,10 +248,10 @@ def parse_yaml_model(
     try:
         instance = model.model_validate(data, context=context)
     except ValidationError as error:
-        place = place_of(path, error.errors()[0]["loc"], entry)
+        place = location_of(path, error.errors()[0]["loc"], entry)
         raise TrapsError(f"{place}{where and ': ' + where}: {faults_of(error, model, also)}") from error
     for field in _converted_values(data, instance):
-        place = place_of(path, field.partition(":")[0].split("."), entry)
+        place = location_of(path, field.partition(":")[0].split("."), entry)
         raise TrapsError(f"{place}{where and ': ' + where}: {field}")
     return instance
 

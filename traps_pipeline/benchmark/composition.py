@@ -76,7 +76,7 @@ def name_benchmark(out: Path, name: str) -> None:
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
 
 
-def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
+def composition_problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
     """Check all records together (numbers against `counts`); return problems in words."""
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:

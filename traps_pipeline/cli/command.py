@@ -241,7 +241,7 @@ def place_of(arguments: argparse.Namespace) -> Place:
     from traps_pipeline.storage import place
     from traps_pipeline.storage.workspace import Workspace
 
-    return place.place_of(arguments.workspace) if arguments.workspace else Workspace.default_place()
+    return place.parse_place(arguments.workspace) if arguments.workspace else Workspace.default_place()
 
 
 def open_workspace(arguments: argparse.Namespace) -> Workspace:
