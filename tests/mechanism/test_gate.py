@@ -19,7 +19,7 @@ from traps_pipeline.mechanism.gate import (
     thresholds,
 )
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.bootstrap import figures_of, interval
+from traps_pipeline.scoring.bootstrap import interval, metrics_of
 
 
 def test_thresholds_are_the_ones_worked_out() -> None:
@@ -54,7 +54,7 @@ def test_the_interval_of_a_gate_has_a_width_where_all_items_agree(right: float) 
     void = np.tile([False, True], n)
     outcomes = Outcomes(void, np.where(void, np.nan, right), np.where(void, right, 0.0))
     names = np.repeat([f"occlusion-{number:03d}" for number in range(n)], 2)
-    figures = figures_of(gating._resample(outcomes, "occlusion", names, 2000, 1))
+    figures = metrics_of(gating._resample(outcomes, "occlusion", names, 2000, 1))
     low, high = interval(figures[:, gating._PECS, 1:], right, (0.0, 1.0))
     outermost = 0.025 ** (1 / n)  # Clopper and Pearson's lower end of n of n; .74 for 12
     assert low <= outermost + 0.02 and high == 1.0 if right else low == 0.0 < high

@@ -35,13 +35,13 @@ from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, draw_scenarios, figures_of, interval, run_sums
+from traps_pipeline.scoring.bootstrap import RESAMPLED_METRICS, draw_scenarios, interval, metrics_of, run_sums
 from traps_pipeline.scoring.metrics import COUNTS
 from traps_pipeline.storage.workspace import Workspace
 
 SHUFFLED = "shuffled labels"
 ALL = "all"
-_PECS = RESAMPLED_FIGURES.index("pecs")
+_PECS = RESAMPLED_METRICS.index("pecs")
 
 
 @dataclass(frozen=True)
@@ -206,9 +206,9 @@ def _rows(
             about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
                 sums = _resample(gated_outcomes, target, names[decisions.place], resamples, seed)
-                about_pecs = interval(figures_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
+                about_pecs = interval(metrics_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
                 dataset_figures.append(values)
-                draws.append(figures_of(sums, in_mean=True)[:, _PECS, 1:])
+                draws.append(metrics_of(sums, in_mean=True)[:, _PECS, 1:])
             area = separation(decisions, outcome.void)
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))

@@ -18,14 +18,14 @@ from traps_pipeline.people.label_units import ABOUT_ANSWERS, TaskName
 from traps_pipeline.people.labels import truths
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED_FIGURES,
+    RESAMPLED_METRICS,
     RESAMPLES,
     SEED,
     Resampling,
     draw_scenarios,
-    figures_of,
     figures_of_shares,
     means_over_runs,
+    metrics_of,
     resampled_sums,
     run_sums,
     shares_of,
@@ -155,11 +155,11 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
         return figures_of_shares(np.stack(fixed, axis=1))
 
     sums = run_sums(group, resampling, named)
-    means = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (figures_of, right)]
+    means = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (metrics_of, right)]
     return {
         dataset: {
-            **with_intervals(RESAMPLED_FIGURES, figures),
-            **with_intervals(RESAMPLED_FIGURES, means[1][dataset], "_corrected"),
+            **with_intervals(RESAMPLED_METRICS, figures),
+            **with_intervals(RESAMPLED_METRICS, means[1][dataset], "_corrected"),
         }
         for dataset, figures in means[0].items()
         if not np.isnan(figures[:, :, 0]).all()

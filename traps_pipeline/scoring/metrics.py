@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["dataset", "model", "regime", "run"]
-CELL_FIGURES = [*METRIC_WORDS, "naive"]
+CELL_METRICS = [*METRIC_WORDS, "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
 OUTCOMES = {"n_answered": JUDGED} | {c.name: c.outcomes for c in COUNT_WORDS.values() if c.outcomes}
@@ -138,7 +138,7 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 
 
 def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return CELL_FIGURES of every cell, (cells,) each."""
+    """Return CELL_METRICS of every cell, (cells,) each."""
     acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
     figures = {name: metric.formula(acc, false_abs, abs_rec) for name, metric in METRIC_WORDS.items()}
     return figures | {"naive": acc * abs_rec}

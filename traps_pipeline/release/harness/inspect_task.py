@@ -12,7 +12,7 @@ from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 
 from traps_pipeline.release.harness.harness_items import about, harness_prompt, items, media_of
-from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
+from traps_pipeline.release.harness.scoring import PanelDecision, judge, run_metrics
 
 _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
 
@@ -62,7 +62,7 @@ def traps_figures() -> Any:
     """Return the metric: PECS and its factors, overall and by dataset, and the figures of two events."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
-        results = figures(PanelDecision.of(score.score.metadata) for score in scores)
+        results = run_metrics(PanelDecision.of(score.score.metadata) for score in scores)
         return {name: value for name, value in results.items() if value is not None}
 
     return compute

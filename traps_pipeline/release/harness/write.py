@@ -23,7 +23,7 @@ from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
 from traps_pipeline.release.harness.harness_items import ABOUT, ITEMS, MEDIA
-from traps_pipeline.release.harness.scoring import TWO_WAY_FIGURES
+from traps_pipeline.release.harness.scoring import TWO_WAY_METRICS
 from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
 
 PACKAGE, LMMS = "traps_harness", "lmms"
@@ -193,9 +193,9 @@ def _lmms(target: Path, about: Mapping[str, Any]) -> None:
                 {
                     "metric": f"traps_{name}",
                     "aggregation": _Function(f"utils.{name}"),
-                    "higher_is_better": name in (*METRIC_WORDS, *TWO_WAY_FIGURES) and name not in less_is_better,
+                    "higher_is_better": name in (*METRIC_WORDS, *TWO_WAY_METRICS) and name not in less_is_better,
                 }
-                for name in (*METRIC_WORDS, *TWO_WAY_FIGURES, "missing", "unread")
+                for name in (*METRIC_WORDS, *TWO_WAY_METRICS, "missing", "unread")
             ],
             "metadata": [{"version": about["version"], "canary": about["canary"]}],
         }

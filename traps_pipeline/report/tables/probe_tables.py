@@ -67,7 +67,7 @@ class RowRule(NamedTuple):
 
 _LAYER_AND_VALUE = ("layer", "value", "low", "high")
 # The figures of a pair of datasets, by the prefix of their columns in `best_layers`.
-PAIR_FIGURES = {
+PAIR_METRICS = {
     "best": RowRule("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
     "chosen": RowRule("transfer", "chosen", _LAYER_AND_VALUE),
     "held_out": RowRule("held_out", "all_sample_best"),
@@ -80,7 +80,7 @@ BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_hel
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return PAIR_FIGURES by model and pair: best, chosen layers, and Cf->Cf at both."""
+    """Return PAIR_METRICS by model and pair: best, chosen layers, and Cf->Cf at both."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -89,14 +89,14 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
     transfers = by_pair("transfer", rows["model"].notna())
     is_known = rows["value"].notna()
-    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_FIGURES.items()}
+    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_METRICS.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
         | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
         | {
             f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan)
-            for name, rule in PAIR_FIGURES.items()
+            for name, rule in PAIR_METRICS.items()
             for c in rule.columns
         }
         | {"note": next((notes_of[key]["note"] for notes_of in notes if key in notes_of), "")}
@@ -175,7 +175,7 @@ def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
         baseline_names = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *baseline_names, "held_noise", "cf_held_noise"]
+        figures = [*(f"{name}_value" for name in PAIR_METRICS), *baseline_names, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = (
             dict[str, Any].fromkeys(figures, "mean")

@@ -28,13 +28,13 @@ N, MISSING, RUNS = (
     Column("n_runs", "Runs", "count"),
 )
 EPOCH = Column("epoch", "Epoch")
-_FIGURES = {
+_METRICS = {
     metric.name: Column(metric.name, metric.heading, metric.unit, spread=f"{metric.name}_std")
     for metric in METRIC_WORDS.values()
 }
-SHARES = tuple(_FIGURES[name] for name in metric_words.SHARES)
-J, PECS = _FIGURES["j"], replace(_FIGURES["pecs"], mark="mark", look="strong")
-OTHER_FIGURES = tuple(column for name, column in _FIGURES.items() if name != "pecs" and column not in SHARES)
+SHARES = tuple(_METRICS[name] for name in metric_words.SHARES)
+J, PECS = _METRICS["j"], replace(_METRICS["pecs"], mark="mark", look="strong")
+OTHER_METRICS = tuple(column for name, column in _METRICS.items() if name != "pecs" and column not in SHARES)
 COUNTS = (N, RUNS, MISSING)
 COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
