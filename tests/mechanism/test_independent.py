@@ -27,7 +27,7 @@ from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_m
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.media import Frames, MediaSpec, sample
+from traps_pipeline.storage.media import Frames, MediaSpec, pick_frames
 from traps_pipeline.video.encode import encode
 
 pytestmark = pytest.mark.slow
@@ -52,7 +52,7 @@ class Subject:
         return self.network.model.language_model
 
     def shown(self, clip: Path) -> Frames:
-        return sample(clip, cast(MediaSpec, self.entry.media))
+        return pick_frames(clip, cast(MediaSpec, self.entry.media))
 
     def prompt(self, frames: np.ndarray, times_s: np.ndarray, question: str = QUESTIONS[1]) -> Prompt:
         return self.of.prompt(SYSTEM, question, frames, times_s)

@@ -37,7 +37,7 @@ from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.prompts import vqa_prompt
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 from traps_pipeline.storage.workspace import Workspace
 
 __all__ = ["entry", "extracted", "patch"]  # fixtures
@@ -137,7 +137,7 @@ def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, ent
             gate = inside.gate(study, "tiny", source=source, threshold=threshold, without=without)
             for row in np.flatnonzero(fold == k):
                 item = items.loc[table["item_id"].iloc[counted.place[row]]]
-                shown = sample(study.resolve(item["clip"]), entry.media)
+                shown = pick_frames(study.resolve(item["clip"]), entry.media)
                 prompt = model.prompt(vqa_prompt("standard"), item["question"], shown.frames, shown.times_s)
                 assert gate.score(model, prompt) == pytest.approx(counted.score[row], abs=1e-6)
                 theirs = bool(counted.score[row] > counted.threshold[threshold][row])

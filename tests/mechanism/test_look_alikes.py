@@ -45,7 +45,7 @@ from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -242,7 +242,7 @@ def test_residual_states_hold_nothing_linear_in_the_nuisances() -> None:
 
 def own_prompt(workspace: Workspace, entry: ModelEntry, row: dict, system: str) -> dict[str, torch.Tensor]:
     assert entry.media is not None
-    shown = sample(workspace.resolve(row["clip"]), entry.media)
+    shown = pick_frames(workspace.resolve(row["clip"]), entry.media)
     model = load_local_model(entry, inside=True)
     return dict(model.prompt(system, row["question"], shown.frames, shown.times_s).inputs)
 
@@ -329,7 +329,7 @@ def test_an_item_has_the_likelihood_of_its_answer_and_of_the_likeliest_abstentio
     rows = {row.item_id: row for row in sentence_rows(study, entry, STANDARD)}
     row, model = rows[item["item_id"]], load_local_model(entry, inside=True)
     assert entry.media is not None
-    shown = sample(study.resolve(item["clip"]), entry.media)
+    shown = pick_frames(study.resolve(item["clip"]), entry.media)
     prompt = model.prompt(system_prompt("standard"), item["question"], shown.frames, shown.times_s)
     said = [*study.mechanism.sentences, "It ends left."]
     tokens = [model.processor.tokenizer(text, add_special_tokens=False).input_ids for text in said]

@@ -32,7 +32,7 @@ from traps_pipeline.mechanism.patching_effects import (
 )
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.registry.entries import get_model
-from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.media import MediaSpec, pick_frames
 
 pytestmark = pytest.mark.slow
 POCKET = "pocket"  # the shipped weights, whose states mean something, beside tiny random ones
@@ -62,7 +62,7 @@ def pair(
 ) -> tuple[LocalModel, RecordedPass, RecordedPass, list[int], Prompt, Prompt]:
     of = of or subject(name)
     if name == POCKET:
-        shown = sample(clip(), cast(MediaSpec, get_model(POCKET).media))
+        shown = pick_frames(clip(), cast(MediaSpec, get_model(POCKET).media))
         target = of.prompt(SYSTEM, QUESTIONS[0], shown.frames, shown.times_s.tolist())
     else:
         target = ask(of)

@@ -35,7 +35,7 @@ from traps_pipeline.models.registry.prompts import vqa_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.media import MediaSpec, pick_frames
 from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import encode
@@ -136,7 +136,7 @@ def test_the_cells_with_the_largest_sums_of_estimates_are_patched_at_every_so_ma
 
 
 def pocket() -> tuple[LocalModel, np.ndarray, np.ndarray]:
-    shown = sample(clip(), get_model("pocket").media or MediaSpec(profile="frames"))
+    shown = pick_frames(clip(), get_model("pocket").media or MediaSpec(profile="frames"))
     return load_local_model(get_model("pocket"), inside=True), shown.frames, shown.times_s
 
 
@@ -232,8 +232,8 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     }
     for (name, which), row in rows.items():
         for times_of in SIDES:
-            shown = sample(workspace.resolve(row["clip"]), entry.media)
-            times = sample(workspace.resolve(rows[name, times_of]["clip"]), entry.media).times_s
+            shown = pick_frames(workspace.resolve(row["clip"]), entry.media)
+            times = pick_frames(workspace.resolve(rows[name, times_of]["clip"]), entry.media).times_s
             prompt = of.prompt(vqa_prompt("standard"), row["question"], shown.frames, times)
             names[content(prompt)] = (name, which, times_of)
     assert len(names) == 2 * 2 * PAIRS  # no two of them alike

@@ -42,7 +42,7 @@ from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.scoring.bootstrap import TAXONOMIES, draw_scenarios, interval, shares_of, with_unseen
-from traps_pipeline.storage.media import Frames, MediaSpec, sample
+from traps_pipeline.storage.media import Frames, MediaSpec, pick_frames
 from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -215,7 +215,7 @@ class Pairs:
         row = self._items[name, which]
         clip, question = self._workspace.resolve(row["clip"]), str(row["question"])
         other_clip = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
-        frames = sample(clip, self._spec)
+        frames = pick_frames(clip, self._spec)
         times = shown_times(frames, clip, self._spec, other_clip)
         prompt = self._model.prompt(self._system, question, frames.frames, times)
         side = Side(prompt, spans(self._model, prompt, self._system, question))
@@ -347,7 +347,7 @@ def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) 
     """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
     if times is None or times == clip:
         return shown.times_s
-    sampled_s = sample(times, spec).times_s
+    sampled_s = pick_frames(times, spec).times_s
     if len(sampled_s) == len(shown.times_s):
         return sampled_s
     return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(sampled_s)), sampled_s)

@@ -14,7 +14,7 @@ import numpy as np
 from traps_pipeline.models.local.backend import LocalBackend, outcome
 from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import Prompt
@@ -68,7 +68,7 @@ class SteeredBackend(LocalBackend):
 
     def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
         """Return a processed prompt, cached in memory; `digest` identifies the frames."""
-        frames = sample(clip, self._spec)
+        frames = pick_frames(clip, self._spec)
         return self._model().prompt(system, user, frames.frames, frames.times_s.tolist())
 
 

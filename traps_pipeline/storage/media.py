@@ -102,7 +102,7 @@ class Frames:
 class Media:
     """A clip as it is sent.
 
-    path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns. sha256: digest of the sent
+    path: the mp4, or the zip of JPEGs; None for profile frames, which `pick_frames` returns. sha256: digest of the sent
     content (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies. times_s: seconds into the
     clip. fps: playing speed of a video; None for other profiles. size_bytes: size of the file, or of the pixels.
     """
@@ -124,7 +124,7 @@ def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later).pick(times)
 
 
-def sample(clip: Path, spec: MediaSpec) -> Frames:
+def pick_frames(clip: Path, spec: MediaSpec) -> Frames:
     """Return a clip's frames as a model sees them; may raise DamagedClip.
 
     Those of profile frames are cached until the file changes, and shared by callers, who must not change them; the
@@ -272,7 +272,7 @@ def _file(note: Path, profile: Profile) -> Path | None:
 def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
     """Pick and encode frames, write the file, and last the note with its digest."""
     _require(clip, clip_digest)
-    frames = sample(clip, spec)
+    frames = pick_frames(clip, spec)
     path, rate = _file(note, spec.profile), None
     if path is None:
         header = str((frames.frames.shape, frames.times_s.tolist())).encode()

@@ -33,7 +33,7 @@ from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.registry.entries import ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.storage.media import MediaStore, sample
+from traps_pipeline.storage.media import MediaStore, pick_frames
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +101,7 @@ def test_the_probabilities_of_the_first_token_are_those_of_its_logits_whatever_i
         (kept, other), loaded = answers(of, asked), load_local_model(of)
         assert other.first_token is None
         given[name] = json.loads(str(kept.first_token))
-    seen = sample(clip(), SIX_FRAMES)
+    seen = pick_frames(clip(), SIX_FRAMES)
     prompt = loaded.prompt(SYSTEM, QUESTIONS[0], seen.frames, seen.times_s)
     with torch.inference_mode():
         values, tokens = loaded.network(**loaded.placed(prompt.inputs)).logits[0, -1].softmax(-1).topk(20)
