@@ -23,7 +23,7 @@ from traps_pipeline.report.tables.table_columns import (
     PECS,
     REGIME,
     RUNS,
-    SHARES,
+    SHARE_COLUMNS,
     N,
     cell_trace,
     interval,
@@ -211,7 +211,7 @@ def _leaderboard(
     board: pd.DataFrame, dataset: str, others: Sequence[str], two_way: pd.DataFrame | None, brief: bool, suffix: str
 ) -> PrintedTable:
     rows = _entries(board, dataset, others)
-    columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, *OTHER_METRICS]
+    columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARE_COLUMNS, *OTHER_METRICS]
     for name in others:
         title = name.replace("_ill_posed", " ill-posed") if brief else TITLES[name]  # a comma would end it in a list
         columns.append(Column(name, f"PECS {title}", "fraction", mark=f"{name}_mark", group=name == others[0]))

@@ -12,14 +12,14 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
+    COUNT_COLUMNS,
     COUNTED,
-    COUNTS,
     DATASET,
     EPOCH,
     MODEL,
     PECS,
     REGIME,
-    SHARES,
+    SHARE_COLUMNS,
     J,
     cell_trace,
     combined_counts,
@@ -62,7 +62,7 @@ def visual_textual(results: Results) -> list[PrintedTable]:
             Column(names["textual"], f"{word} textual %", "percent"),
             Column(names["gap"], f"{word} gap", "ratio", mark=names["mark"]),
         ]
-    columns += COUNTS
+    columns += COUNT_COLUMNS
     notes = [
         epochs(rates.assign(dataset=rates["model"])),
         "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
@@ -120,7 +120,7 @@ def uplift(results: Results) -> list[PrintedTable]:
         Column("ratio", "Ratio", "ratio", digits=2, mark="mark"),
         *(Column(f"{r}_false_abs", f"FalseAbs %, {r}", "percent") for r in regimes),
         *(Column(f"{r}_pecs", f"PECS, {r}", "fraction", mark=f"{r}_mark") for r in regimes),
-        *COUNTS,
+        *COUNT_COLUMNS,
     ]
     notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0"]
     notes += [*marks(table), *refusals]
@@ -140,8 +140,8 @@ def naive(results: Results) -> list[PrintedTable]:
     gap_cells = analyses.naive_gap(cells, NAIVE_THRESHOLD)
     rows = with_titles(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
     columns = [
-        MODEL, DATASET, SHARES[0], SHARES[1], SHARES[2], PECS,
-        Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNTS, EPOCH,
+        MODEL, DATASET, SHARE_COLUMNS[0], SHARE_COLUMNS[1], SHARE_COLUMNS[2], PECS,
+        Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNT_COLUMNS, EPOCH,
     ]  # fmt: skip
     notes = [
         f"guided; Naive = Acc × AbsRec of the means over runs; {len(gap_cells)} of {len(rows)} cells differ by more "
@@ -159,7 +159,7 @@ def naive(results: Results) -> list[PrintedTable]:
 def zero_boundary(results: Results) -> list[PrintedTable]:
     """Return cells with PECS 0: voids not told from controls, or Acc 0."""
     rows = sort_rows(with_titles(with_marks(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
-    columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
+    columns = [MODEL, DATASET, REGIME, *SHARE_COLUMNS, PECS, *COUNT_COLUMNS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
     zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
     notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in n_cells.items()), epochs(rows)]
@@ -172,7 +172,7 @@ def zero_boundary(results: Results) -> list[PrintedTable]:
 def frontier(results: Results) -> list[PrintedTable]:
     """Return the Pareto frontier in (Acc, J), averaged over datasets, by regime."""
     rows = sort_rows(with_marks(analyses.frontier(results.overall)), ["regime"])
-    columns = [REGIME, MODEL, SHARES[0], J, PECS, *COUNTS]
+    columns = [REGIME, MODEL, SHARE_COLUMNS[0], J, PECS, *COUNT_COLUMNS]
     notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
     return [PrintedTable("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
 
@@ -199,8 +199,8 @@ def reasoning(results: Results) -> list[PrintedTable]:
     table = sort_rows(with_titles(table), ["thinking", "regime", "dataset"])
     columns = [
         Column("thinking", "Thinking"), Column("other", "Other"), REGIME, DATASET,
-        *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
-        Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNTS,
+        *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARE_COLUMNS),
+        Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNT_COLUMNS,
     ]  # fmt: skip
     notes = [epochs(results.cells), "thinking minus other; Δ of shares in points; missing: items of both models"]
     notes += [*marks(table), *refusals]
@@ -227,7 +227,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
         Column("right_regime", "Regime"), Column("difference", "Δ PECS", "fraction", mark="mark"),
         Column("ci_low", "95 % CI from", "fraction"), Column("ci_high", "to", "fraction"),
         Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("separable", "Separable"),
-        *COUNTS, Column("refused", "Refused"),
+        *COUNT_COLUMNS, Column("refused", "Refused"),
     ]  # fmt: skip
     notes = ["left minus right; the other metrics and datasets are in the workspace's table `contrasts`"]
     if TOO_FEW in set(rows["separable"]):
@@ -278,8 +278,8 @@ def degenerate(results: Results) -> list[PrintedTable]:
     """Return expected and measured scores of strategies that do not discriminate."""
     rows = analyses.degenerate_strategies()
     columns = [
-        Column("strategy", "Strategy"), *SHARES, Column("j", "J", "fraction"), Column("naive", "Naive", "fraction"),
-        Column("pecs", "PECS", "fraction"),
+        Column("strategy", "Strategy"), *SHARE_COLUMNS, Column("j", "J", "fraction"),
+        Column("naive", "Naive", "fraction"), Column("pecs", "PECS", "fraction"),
     ]  # fmt: skip
     notes = ["in expectation; Acc is open where the strategy does not determine it, and PECS is still 0"]
     if results.is_study:
@@ -289,8 +289,9 @@ def degenerate(results: Results) -> list[PrintedTable]:
         rows = with_marks(rows.merge(measured_rows, on="strategy", how="left"))
         columns += [
             Column("measured_j", "J, measured", "fraction", spread="measured_j_std"),
-            Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std", mark="mark"), *COUNTS,
-        ]  # fmt: skip
+            Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std", mark="mark"),
+            *COUNT_COLUMNS,
+        ]
         notes.append("measured: overall, standard; PECS clips J at 0, so chance alone lifts a random strategy above 0")
         notes += marks(rows)
     trace: Trace = lambda row, field: (  # noqa: E731

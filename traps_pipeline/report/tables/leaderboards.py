@@ -8,13 +8,13 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
-    COUNTS,
+    COUNT_COLUMNS,
     DATASET,
     EPOCH,
     MODEL,
     PECS,
     REGIME,
-    SHARES,
+    SHARE_COLUMNS,
     J,
     best_first,
     cell_trace,
@@ -49,7 +49,7 @@ def replication_overall(results: Results) -> list[PrintedTable]:
 def _overall(results: Results, name: str, title: str, replication: bool) -> PrintedTable:
     rows = with_marks(results.overall)
     rows = rows.loc[rows["model"].isin(analyses.models_of(group="replication")) == replication]
-    columns = [MODEL, REGIME, PECS, *SHARES, J]
+    columns = [MODEL, REGIME, PECS, *SHARE_COLUMNS, J]
     notes = [epochs(results.cells), "equal-weight mean over the four datasets", *marks(rows)]
     if results.is_study:
         records = rows.to_dict("records")
@@ -64,7 +64,7 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
             columns.append(Column("published_pecs", "published PECS", "fraction"))
             notes.append("published PECS: as printed in the paper, from its own benchmark and epochs")
     return PrintedTable(
-        name, title, best_first(rows), [*columns, *COUNTS], notes, no_overall(results, replication), cell_trace
+        name, title, best_first(rows), [*columns, *COUNT_COLUMNS], notes, no_overall(results, replication), cell_trace
     )
 
 
@@ -98,7 +98,7 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
     cells = with_marks(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
     rows = sort_rows(with_titles(rows), ["model", "dataset", "regime"])
-    columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
+    columns = [MODEL, DATASET, REGIME, PECS, *SHARE_COLUMNS, *COUNT_COLUMNS, EPOCH]
     notes = [epochs(rows), *marks(rows)]
     reason = "no model of the replication families"
     title = "Replication families, by dataset"
@@ -122,7 +122,7 @@ def expanded(results: Results) -> list[PrintedTable]:
             tables.append(
                 PrintedTable(
                     f"expanded_{dataset}_{regime}", f"{TITLES[dataset]}, {regime}", best_first(rows),
-                    [MODEL, *SHARES, PECS, *COUNTS, EPOCH], notes, "no model was asked here", cell_trace,
+                    [MODEL, *SHARE_COLUMNS, PECS, *COUNT_COLUMNS, EPOCH], notes, "no model was asked here", cell_trace,
                 )
             )  # fmt: skip
     return tables

@@ -11,7 +11,7 @@ from traps_pipeline.report.tables.table_columns import (
     DATASET,
     MISSING,
     PECS,
-    SHARES,
+    SHARE_COLUMNS,
     N,
     epochs,
     marks,
@@ -75,7 +75,7 @@ def _sub_rows(results: Results, taxonomy: str) -> pd.DataFrame:
 def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> PrintedTable:
     columns = [
         Column("sub_scenario", "Sub-scenario"), Column("answer_type", "Answer"), N,
-        Column("n_models", "Models", "count"), *SHARES, PECS,
+        Column("n_models", "Models", "count"), *SHARE_COLUMNS, PECS,
         Column("guided_abs_rec", "AbsRec %, guided", "percent"), Column("guided_pecs", "PECS, guided", "fraction"),
         Column("abs_rec_uplift", "Δ AbsRec, guided", "percent"),
         Column("false_abs_uplift", "Δ FalseAbs, guided", "percent"),

@@ -32,10 +32,10 @@ _METRICS = {
     metric.name: Column(metric.name, metric.heading, metric.unit, spread=f"{metric.name}_std")
     for metric in METRIC_WORDS.values()
 }
-SHARES = tuple(_METRICS[name] for name in metric_words.SHARES)
+SHARE_COLUMNS = tuple(_METRICS[name] for name in metric_words.SHARES)
 J, PECS = _METRICS["j"], replace(_METRICS["pecs"], mark="mark", look="strong")
-OTHER_METRICS = tuple(column for name, column in _METRICS.items() if name != "pecs" and column not in SHARES)
-COUNTS = (N, RUNS, MISSING)
+OTHER_METRICS = tuple(column for name, column in _METRICS.items() if name != "pecs" and column not in SHARE_COLUMNS)
+COUNT_COLUMNS = (N, RUNS, MISSING)
 COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
