@@ -18,7 +18,7 @@ from traps_pipeline.models.request import JUDGED
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Records, StudyFile
 from traps_pipeline.pipeline.schemes import CELL, EVALUATION, by_dataset, by_evaluation
-from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stage import dep, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -78,7 +78,7 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
 
 @_stage(
     RESPONSES,
-    parents=[of(items, by_dataset), of(models, by_evaluation), of(prompts, by_evaluation)],
+    parents=[dep(items, by_dataset), dep(models, by_evaluation), dep(prompts, by_evaluation)],
     code=f"3.{READING}",
     cost="money",
     checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],
@@ -100,7 +100,7 @@ def _excess_of_invalid(workspace: Workspace, key: str | None, output: StageOutpu
 
 @_stage(
     VOTES,
-    parents=[of(items, by_dataset), responses, judges],
+    parents=[dep(items, by_dataset), responses, judges],
     code="5",
     cost="money",
     checks=[
@@ -130,7 +130,7 @@ def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput
 
 @_stage(
     VERDICTS,
-    parents=[of(items, by_dataset), responses, votes, judges],
+    parents=[dep(items, by_dataset), responses, votes, judges],
     code="4",
     checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
     side_by_side=True,

@@ -5,7 +5,7 @@ from functools import partial
 from traps_pipeline.pipeline.graph import Parent
 from traps_pipeline.pipeline.pieces import Piece, make_pieces
 from traps_pipeline.pipeline.previews import Markdown
-from traps_pipeline.pipeline.stage import code_of, is_declared, of, source, stage
+from traps_pipeline.pipeline.stage import code_of, dep, is_declared, source, stage
 from traps_pipeline.pipeline.stages import judging_stages, people_stages, scoring_stages
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, TABLE_REPORTS
 from traps_pipeline.scoring.published import published_digest
@@ -29,7 +29,7 @@ def published(workspace: Workspace, _: None) -> str:
 
 
 def _parents(*names: str) -> list[Parent]:
-    return [of(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
+    return [dep(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
 
 
 @_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
