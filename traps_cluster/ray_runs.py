@@ -25,7 +25,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import missing
+from traps_pipeline.base.extras import find_missing
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.entries import LOCAL, get_model
@@ -76,7 +76,7 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
     Other hosts must see the study, Ray's address must be known, and a daemon must take runs from the queue.
     """
     where = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
-    if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
+    if absent := find_missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
         raise TrapsError(
             f"{where}runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
             "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"

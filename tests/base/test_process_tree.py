@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.build.processes import MARK, marked, wait_until_gone
-from traps_pipeline.base.process_tree import split
+from traps_pipeline.base.process_tree import fork_worker
 
 END_S = 60  # more than nine times what it takes
 # A command of two processes. Below the second one: a program that ends at SIGTERM, which has started one in a session
@@ -81,4 +81,4 @@ def test_the_first_process_ends_with_the_code_of_the_second() -> None:
 
 def test_another_system_gets_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert split(1) is None
+    assert fork_worker(1) is None

@@ -29,7 +29,7 @@ from traps_pipeline.models.money.budget import Budget, worst_case_usd
 from traps_pipeline.models.registry.accounts import Account
 from traps_pipeline.models.request import Outcome, TransientError
 from traps_pipeline.models.wire.api import ApiBackend
-from traps_pipeline.models.wire.httpx_transport import Wire, get
+from traps_pipeline.models.wire.httpx_transport import Wire, get_url
 from traps_pipeline.storage.study import Study
 
 pytestmark = pytest.mark.promise  # the client library alone takes seconds to import
@@ -130,7 +130,7 @@ def test_loopback_addresses_are_asked_directly_whatever_the_environment_says(
     with answering(200, body().encode()) as provider:
         outcome, _ = call(f"http://{host}:{provider.port}/v1")
         assert outcome and outcome.kind == "answer"
-        assert get(f"http://{host}:{provider.port}/v1/models", {}, 20.0).status_code == 200
+        assert get_url(f"http://{host}:{provider.port}/v1/models", {}, 20.0).status_code == 200
     assert provider.requests == ["POST /v1/chat/completions", "GET /v1/models"]
 
 
@@ -150,7 +150,7 @@ def test_a_certificate_that_a_variable_names_is_trusted(environment: pytest.Monk
     tls, certificate = self_signed(tmp_path)
     environment.setenv("SSL_CERT_FILE", str(certificate))
     with answering(200, b"{}", tls=tls) as provider:
-        assert get(f"https://localhost:{provider.port}/v1/models", {}, 20.0).status_code == 200
+        assert get_url(f"https://localhost:{provider.port}/v1/models", {}, 20.0).status_code == 200
 
 
 def test_a_certificate_that_is_named_or_renewed_in_mid_run_is_trusted_by_the_same_transport(

@@ -74,13 +74,13 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.base.extras import require
+    from traps_pipeline.base.extras import require_extra
     from traps_pipeline.release.content import content_of
     from traps_pipeline.release.folder import CARD, Options, write_release
     from traps_pipeline.release.signing import sign
 
     if arguments.sign:
-        require("sign")  # check it before anything is written
+        require_extra("sign")  # check it before anything is written
     workspace, target = open_workspace(arguments), arguments.folder.absolute()
     options = Options(
         arms=arguments.arms,

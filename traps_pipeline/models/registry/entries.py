@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.keys import check_parameters
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.plugins import Group, require_known, versioned
+from traps_pipeline.base.plugins import Group, name_with_package, require_known
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import faults_of, parse_yaml_model, read_yaml
 from traps_pipeline.models.reading.thinking import Marks, marks_of
@@ -110,7 +110,7 @@ class Entry(BaseModel):
     @property
     def endpoint(self) -> str:
         """The endpoint in the ledger key: litellm's name, or the kind of backend with the package that adds it."""
-        return self.provider_id or versioned(self.plugins, self.backend)
+        return self.provider_id or name_with_package(self.plugins, self.backend)
 
     @property
     def max_tokens(self) -> int:
