@@ -15,7 +15,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import Correction, fold, read_corrections
+from traps_pipeline.benchmark.corrections import Correction, apply_corrections, read_corrections
 from traps_pipeline.benchmark.decisions import (
     FILE,
     DecidedMeanwhile,
@@ -38,7 +38,7 @@ def decision(action: str, scenario_id: str = ID, **changes: Any) -> Correction:
 
 def benchmark(folder: Path) -> dict[str, Any]:
     """Every scenario's version, and which are there, after the decisions in a folder."""
-    return {id_: scenario.version for id_, scenario in fold(RELEASED, read_corrections(folder)).items()}
+    return {id_: scenario.version for id_, scenario in apply_corrections(RELEASED, read_corrections(folder)).items()}
 
 
 def test_a_decision_is_one_line_in_the_format_of_corrections(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from tests.build.errors import raises
 from tests.build.harness import ours
 from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.held_out import held_out_key, opaque
+from traps_pipeline.benchmark.held_out import held_out_key, opaque_name
 from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.prompts import system_prompt
@@ -158,7 +158,7 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
     given = json.loads(answers.read_text())["json"]["random-50"]
     workspace, key = Workspace.open(unasked.workspace), held_out_key(tmp_path / "key", make=True)
     ids = sorted(workspace.tables.read_all(ITEMS)["item_id"])
-    lines = [{"item": opaque(key, id_), "regime": "json", "text": given[id_]} for id_ in ids]
+    lines = [{"item": opaque_name(key, id_), "regime": "json", "text": given[id_]} for id_ in ids]
     path = tmp_path / "answers.jsonl"
     command = ("study", "import-answers", unasked.root / EXPERIMENT, path, "--model", "random-50")
     plain = [line | {"item": id_} for line, id_ in zip(lines, ids, strict=True)]

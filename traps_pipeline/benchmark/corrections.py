@@ -173,7 +173,7 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
     return corrections
 
 
-def fold(
+def apply_corrections(
     released: Mapping[str, SceneSpec | ReleasedLine[SceneSpec]], corrections: Sequence[tuple[str, Correction]]
 ) -> dict[str, Scenario]:
     """Return scenarios by id after all decisions. Raises TrapsError with `file:line`."""
@@ -212,7 +212,7 @@ def _check_decision(
         raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
 
 
-def fold_two_events(
+def apply_to_lanes(
     released: Mapping[str, ReleasedLine[TwoEventsSpec]], corrections: Sequence[tuple[str, Correction]]
 ) -> dict[str, LaneScenario]:
     """Return scenarios of two events by id after all decisions about them. Raises TrapsError with `file:line`."""
@@ -289,7 +289,7 @@ def _add(where: str, correction: Correction) -> Scenario:
 def load_scenarios(study: Study) -> dict[str, Scenario]:
     """Return a study's corrected subset. Raises TrapsError for unknown scenarios."""
     check_benchmark(study)
-    return subset(corrected_scenarios(), study)
+    return of_study(corrected_scenarios(), study)
 
 
 def current_benchmark() -> str:
@@ -316,7 +316,7 @@ def _records_advice(benchmark: str) -> str:
 @cache
 def corrected_scenarios() -> dict[str, Scenario]:
     """Return the released records after all corrections."""
-    return fold(released_lines(), of_pairs(read_corrections()))
+    return apply_corrections(released_lines(), of_pairs(read_corrections()))
 
 
 def of_pairs(corrections: Iterable[tuple[str, Correction]]) -> list[tuple[str, Correction]]:
@@ -328,16 +328,16 @@ def of_pairs(corrections: Iterable[tuple[str, Correction]]) -> list[tuple[str, C
 @cache
 def corrected_two_events() -> dict[str, LaneScenario]:
     """Return the released records of two events after all corrections."""
-    return fold_two_events(two_events_lines(), read_corrections())
+    return apply_to_lanes(two_events_lines(), read_corrections())
 
 
 def load_two_events(study: Study) -> dict[str, LaneScenario]:
     """Return a study's corrected subset of scenarios of two events."""
     check_benchmark(study)
-    return subset(corrected_two_events(), study, two_events_lines())
+    return of_study(corrected_two_events(), study, two_events_lines())
 
 
-def subset(
+def of_study(
     scenarios: Mapping[str, _OfFamily], study: Study, released: Mapping[str, ReleasedLine[Any]] | None = None
 ) -> dict[str, _OfFamily]:
     """Return the study's named scenarios, or the first n per family, or all. released: by default those of pairs.

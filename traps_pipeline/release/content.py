@@ -12,7 +12,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.benchmark.corrections import load_two_events
-from traps_pipeline.benchmark.held_out import opaque
+from traps_pipeline.benchmark.held_out import opaque_name
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.judging.panel import tasks_for
@@ -167,7 +167,7 @@ def held_out_rows(items: Rows, digests: Mapping[str, str], key: bytes, canary: s
     """Return one row per item, sorted by opaque name; no field reveals the answer. digests: of each item's own clip."""
     rows = [
         HeldOutItemRow(
-            item=opaque(key, row["item_id"]),
+            item=opaque_name(key, row["item_id"]),
             question=row["question"],
             file_name=f"items/{clip_name(digests[row['item_id']])}",
             media_digest=digests[row["item_id"]],
