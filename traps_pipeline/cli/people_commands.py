@@ -107,9 +107,9 @@ def write_labels(arguments: argparse.Namespace) -> int:
 
 
 def validate_judge(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.people.judge_validation import validate, validation_text
+    from traps_pipeline.people.judge_validation import validation_rows, validation_text
 
-    rows = validate(open_workspace(arguments), arguments.file)
+    rows = validation_rows(open_workspace(arguments), arguments.file)
     if arguments.json:
         print_json(rows)
     else:

@@ -15,7 +15,7 @@ import pandas as pd
 from traps_pipeline.people.human_score_rows import CORRECTED, PANEL_ERRORS
 from traps_pipeline.people.human_scores import stratum_weights, with_intervals
 from traps_pipeline.people.label_units import ABOUT_ANSWERS, TaskName
-from traps_pipeline.people.labels import truths
+from traps_pipeline.people.labels import true_labels
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED_METRICS,
@@ -105,7 +105,7 @@ def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
     """Return sensitivity and specificity by task and draw; NaN without yes, or no."""
     errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
-        answers = truths(labels, task).dropna(subset=["truth"])
+        answers = true_labels(labels, task).dropna(subset=["truth"])
         if answers.empty:
             continue
         truth, panel = answers["truth"].to_numpy(bool), answers["panel"].to_numpy(bool)
@@ -127,7 +127,7 @@ def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
 
 
 def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: str) -> dict[str, Any]:
-    answers = truths(labels, task)
+    answers = true_labels(labels, task)
     decided_answers = answers.dropna(subset=["truth"])
     n_yes = int(decided_answers["truth"].to_numpy(bool).sum())
     if n_yes in (0, len(decided_answers)):

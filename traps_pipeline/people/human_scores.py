@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.people.human_score_rows import HUMAN_ROW
-from traps_pipeline.people.labels import agreement_of, matrix
+from traps_pipeline.people.labels import agreement_of, label_matrix
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED_METRICS,
@@ -51,7 +51,7 @@ def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 
 
 def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, Any]:
-    _, agreement, alpha = agreement_of(matrix(clips, "abstained"))
+    _, agreement, alpha = agreement_of(label_matrix(clips, "abstained"))
     return {
         "dataset": dataset,
         "n_people": clips["annotator"].nunique(),
