@@ -29,7 +29,7 @@ from traps_pipeline.mechanism.patching_stage import (
 )
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
-from traps_pipeline.models.local.spans import changed_tokens, spans
+from traps_pipeline.models.local.spans import changed_tokens, token_spans
 from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import vqa_prompt
 from traps_pipeline.protocol.cells import Extraction
@@ -142,7 +142,7 @@ def pocket() -> tuple[LocalModel, np.ndarray, np.ndarray]:
 
 def side(of: LocalModel, frames: np.ndarray, times_s: np.ndarray, question: str = QUESTION) -> Side:
     prompt = of.prompt(SYSTEM, question, frames, times_s)
-    return Side(prompt, spans(of, prompt, SYSTEM, question))
+    return Side(prompt, token_spans(of, prompt, SYSTEM, question))
 
 
 def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
@@ -171,7 +171,7 @@ def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
 def test_where_pixels_do_not_come_token_by_token_all_visual_tokens_count_as_changed() -> None:
     of = model("llava-next-video")
     prompt = ask(of)
-    parts = spans(of, prompt, SYSTEM, "Does it stop?")
+    parts = token_spans(of, prompt, SYSTEM, "Does it stop?")
     assert changed_tokens(prompt, prompt, parts["visual"]) is None
     groups = groups_of(Side(prompt, parts), Side(prompt, parts))
     assert groups is not None and not groups["unchanged"].any()

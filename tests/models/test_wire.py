@@ -24,7 +24,7 @@ from tests.conftest import KEY, SECRET
 from tests.providers.servers import answering, closed_port, self_signed, silent
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.asking.participants import Participants, attempt
+from traps_pipeline.models.asking.participants import Participants, ask_once
 from traps_pipeline.models.money.budget import Budget, worst_case_usd
 from traps_pipeline.models.registry.accounts import Account
 from traps_pipeline.models.request import Outcome, TransientError
@@ -52,7 +52,7 @@ async def asking(base_url: str, budget: Budget, timeout_s: float = LONG_S, **lim
     account, entry = Account(key=KEY, base_url=base_url), entry_of(MODEL)
     entry = entry.model_copy(update={"limits": entry.limits.model_copy(update={"timeout_s": timeout_s, **limits})})
     asked = Participants({"m": entry}, lambda e: ApiBackend(e, account), Study(budget_usd=10.0), {"a": Account()})
-    attempted = await attempt(asked["m"], request(), allowed_by(budget))
+    attempted = await ask_once(asked["m"], request(), allowed_by(budget))
     return attempted and attempted[0]
 
 

@@ -20,7 +20,7 @@ from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.judging.judging_rows import VoteRow
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.asking.answers import answer_request, asked_items
-from traps_pipeline.models.asking.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect
+from traps_pipeline.models.asking.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect_outcomes
 from traps_pipeline.models.asking.backends import make_backend, make_plugin_backend
 from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.reading.judged_answers import (
@@ -44,7 +44,7 @@ from traps_pipeline.models.registry.judges import (
     vote_prompt,
     vote_schema,
 )
-from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
+from traps_pipeline.models.request import JUDGED_OUTCOMES, WITH_TEXT, Backend, Request
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
@@ -292,8 +292,8 @@ def ask_judges(
     calls: Callable[[AnyCell], Sequence[AnyCall]],
     finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished],
 ) -> Iterator[Finished]:
-    """Call `collect` for judges, with the ledger of votes."""
-    return collect(workspace, stage, workspace.votes, judges, cells, calls, finish, _make_judge)
+    """Call `collect_outcomes` for judges, with the ledger of votes."""
+    return collect_outcomes(workspace, stage, workspace.votes, judges, cells, calls, finish, _make_judge)
 
 
 def _make_judge(entry: Entry) -> Backend:
@@ -331,7 +331,7 @@ def judged_answers(
     """
     items = {item["item_id"]: item for item in asked_items(workspace, cell.dataset)}
     # A steered answer may be cut off.
-    columns, judged = (_ANSWERED, JUDGED) if table is RESPONSES else (None, WITH_TEXT)
+    columns, judged = (_ANSWERED, JUDGED_OUTCOMES) if table is RESPONSES else (None, WITH_TEXT)
     answers = workspace.tables.records(table, cell.partition, columns)
     for answer in islice(answers, start, None if count is None else start + count):
         if answer["outcome"] not in judged:

@@ -12,7 +12,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.models.registry.judges import PANEL_SIZES, is_of_rules, panel_id
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.ratings import (
     ABSTENTION,
@@ -80,7 +80,7 @@ def verdicts_of(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFram
     """
     rows = responses.merge(items, on="item_id", how="left", validate="many_to_one")
     _refuse(rows, rows["scenario_id"].isna().to_numpy(), "item {} is no longer in items", "responses")
-    cast, judged = ratings(votes), rows["outcome"].isin(JUDGED).to_numpy()
+    cast, judged = ratings(votes), rows["outcome"].isin(JUDGED_OUTCOMES).to_numpy()
     is_control = (rows["side"] == "control").to_numpy()
     abstention, has_abstention = cast.on(rows, ABSTENTION)
     correctness, has_correctness = cast.on(rows, CORRECTNESS)

@@ -21,7 +21,7 @@ from traps_pipeline.mechanism.margin import abstention_tokens
 from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, record_pass, require_patchable
 from traps_pipeline.models.local.model import LocalModel
 from traps_pipeline.models.local.prompt_batches import Prompt
-from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.local.spans import token_spans
 from traps_pipeline.models.local.vision_cache import ClipMemory
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def _zero(subject: Subject) -> str:
 
 def _parts(subject: Subject) -> str:
     prompt, question = subject.prompts[1], QUESTIONS[1]
-    parts, decode = spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
+    parts, decode = token_spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
     ids = prompt.inputs["input_ids"][0]
     for name, text in (("system", SYSTEM), ("question", question)):
         decoded_text = "".join(decode(ids[parts[name]]).split())
@@ -168,7 +168,7 @@ def _parts(subject: Subject) -> str:
 
 def _check_pooling(subject: Subject) -> str:
     prompt = subject.prompts[1]
-    positions = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
+    positions = token_spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
     pooled_state = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
     mean_state = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
     _require(
@@ -201,7 +201,7 @@ def _check_times(subject: Subject) -> str:
 
 def _require_stamps(subject: Subject, slow: Prompt) -> float:
     """Return how far written times are from those of the frames that they stand for, at half the speed."""
-    parts = spans(subject.model, slow, SYSTEM, QUESTIONS[1])
+    parts = token_spans(subject.model, slow, SYSTEM, QUESTIONS[1])
     ids, places = slow.inputs["input_ids"][0], np.flatnonzero(parts["stamps"])
     runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)  # a stamp each, between pictures
     text = " ".join(subject.model.processor.tokenizer.decode(ids[run]) for run in runs)

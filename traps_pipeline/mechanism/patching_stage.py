@@ -36,7 +36,7 @@ from traps_pipeline.mechanism.patching_effects import (
     require_patchable,
 )
 from traps_pipeline.mechanism.probing_versions import extraction_version
-from traps_pipeline.models.local.spans import changed_tokens, spans
+from traps_pipeline.models.local.spans import changed_tokens, token_spans
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Extraction
@@ -218,7 +218,7 @@ class Pairs:
         frames = pick_frames(clip, self._spec)
         times = shown_times(frames, clip, self._spec, other_clip)
         prompt = self._model.prompt(self._system, question, frames.frames, times)
-        side = Side(prompt, spans(self._model, prompt, self._system, question))
+        side = Side(prompt, token_spans(self._model, prompt, self._system, question))
         self._parts[name, which, times_of] = side.parts
         return side
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.models.local.backend import LocalBackend, outcome
+from traps_pipeline.models.local.backend import LocalBackend, local_outcome
 from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.storage.media import pick_frames
@@ -58,7 +58,7 @@ class SteeredBackend(LocalBackend):
                 answers = model.generate(prompts, max_tokens, None, hook, stopped=stopped)
             for number, answer in zip(numbers, answers, strict=True):
                 counts = (answer.prompt_tokens, answer.completion_tokens)
-                outcomes[number] = outcome(answer.text, answer.finish_reason, *counts, model.served_model)
+                outcomes[number] = local_outcome(answer.text, answer.finish_reason, *counts, model.served_model)
         return [outcomes[number] for number in range(len(batch))]
 
     def _model(self) -> Any:

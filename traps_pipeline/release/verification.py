@@ -29,7 +29,7 @@ from traps_pipeline.models.reading.judged_answers import is_correct
 from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.models.registry.judges import RULE, RULES_VERSION, id_of_judges
 from traps_pipeline.models.registry.prompts import prompt_version
-from traps_pipeline.models.request import JUDGED, Outcome, Request
+from traps_pipeline.models.request import JUDGED_OUTCOMES, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, dataset_of
 from traps_pipeline.protocol.regimes import REGIMES
@@ -218,11 +218,11 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
         if any(row[name] != item[name] for name in _ITEM_COLUMNS):
             yield f"answer of {_row_name(row)}: its pair, side, dataset or version is not its item's"
         text = row["text"] or ""
-        if (row["outcome"] in JUDGED) != bool(text.strip()):
+        if (row["outcome"] in JUDGED_OUTCOMES) != bool(text.strip()):
             yield f"answer of {_row_name(row)}: outcome {row['outcome']!r} does not go with its text"
-        elif row["outcome"] in JUDGED and (reason := degenerate(text)):
+        elif row["outcome"] in JUDGED_OUTCOMES and (reason := degenerate(text)):
             yield f"answer of {_row_name(row)}: {reason}, so it is none"
-        elif row["outcome"] in JUDGED and row["is_json"] != read_answer(row, None, row["regime"]).is_json:
+        elif row["outcome"] in JUDGED_OUTCOMES and row["is_json"] != read_answer(row, None, row["regime"]).is_json:
             yield f"answer of {_row_name(row)}: is_json is {row['is_json']}, which its text is not"
     expected = dict[str, set[str]]()
     for id_, item in items.items():
@@ -253,7 +253,9 @@ def _wrong_votes(
 ) -> Iterator[str]:
     seats = {seat.id: seat for seat in submission.about.judges}
     texts = {
-        (row["item_id"], row["model"], row["regime"], row["run"]): row for row in answers if row["outcome"] in JUDGED
+        (row["item_id"], row["model"], row["regime"], row["run"]): row
+        for row in answers
+        if row["outcome"] in JUDGED_OUTCOMES
     }
     cast = dict[tuple[Any, ...], set[tuple[str, str]]]()
     for row in votes:

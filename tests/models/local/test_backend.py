@@ -28,7 +28,7 @@ from traps_pipeline.mechanism.adapter_checks import CHECKS
 from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
-from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds, worker
+from traps_pipeline.models.local.backend import LocalBackend, local_outcome, seeds, worker
 from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.registry.entries import ModelEntry, effective_params, load_models
@@ -117,7 +117,7 @@ def test_the_probabilities_of_the_first_token_are_those_of_its_logits_whatever_i
 
 def test_an_answer_cut_off_is_truncated_and_nothing_is_empty() -> None:
     def kind(text: str, finish: str) -> tuple[str, str | None]:
-        made = outcome(text, finish, 10, 3, "m")
+        made = local_outcome(text, finish, 10, 3, "m")
         return made.kind, made.text
 
     assert kind(" left ", "stop") == ("answer", "left")

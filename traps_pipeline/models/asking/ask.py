@@ -19,7 +19,7 @@ from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
 from traps_pipeline.ledger.rows import settles
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.asking.draining import drain_on_interrupt
-from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, ask_once, ledger_row
 from traps_pipeline.models.asking.refusals import CONTROL, RefusedCalls, control_outcome, refusal, refused_calls
 from traps_pipeline.models.money.budget import Budget, BudgetReached
 from traps_pipeline.models.money.spending import open_budget, share_accounts
@@ -76,7 +76,7 @@ class Work(Generic[AnyCell, AnyCall, Finished]):
     is_counted: bool = False  # the progress was told of all calls before the first
 
 
-def collect(
+def collect_outcomes(
     workspace: Workspace,
     stage: str,
     ledger: Ledger,
@@ -156,7 +156,7 @@ class _Asking:
             return False
         request, name = queue.popleft(), participant.entry.id
         context = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
-        attempt_result = await attempt(participant, request, context)
+        attempt_result = await ask_once(participant, request, context)
         if attempt_result is None:
             return False
         outcome = attempt_result[0] if self.again is None else self.again(attempt_result[0])

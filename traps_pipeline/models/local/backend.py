@@ -101,7 +101,7 @@ class LocalBackend:
         answers = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
         return [
             replace(
-                outcome(
+                local_outcome(
                     answer.text,
                     answer.finish_reason,
                     answer.prompt_tokens,
@@ -127,7 +127,7 @@ def seeds(requests: Sequence[Request]) -> list[int]:
     return [int(request.key[:16], 16) for request in requests]
 
 
-def outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
+def local_outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
     """Return an answer's outcome: truncated at the limit, empty without text."""
     text = text.strip()
     kind = ("truncated" if finish == "length" else "answer") if text else "empty"

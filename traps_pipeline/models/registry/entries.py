@@ -33,7 +33,7 @@ MODELS_FILE = Path(os.environ.get(MODELS_VARIABLE) or ASSETS / "models.yaml").ab
 # The protocol's parameters (docs/spec.md 3.1): parameter to its providers' names and its value. An entry that
 # sends something else, or nothing, says why under `waivers`.
 Protocol = Mapping[str, tuple[tuple[str, ...], Any]]
-PROTOCOL: Protocol = {
+PROTOCOL_PARAMS: Protocol = {
     "temperature": (("temperature",), 0.8),
     "top_p": (("top_p",), 0.95),
     "max_tokens": (("max_tokens", "max_completion_tokens"), 8000),
@@ -119,7 +119,7 @@ class Entry(BaseModel):
 
     def protocol(self) -> Protocol:
         """Return the protocol's parameters for such a participant, with names and values."""
-        return PROTOCOL
+        return PROTOCOL_PARAMS
 
     def _check_waivers(self, protocol: Protocol) -> None:
         for parameter, (names, value) in protocol.items():

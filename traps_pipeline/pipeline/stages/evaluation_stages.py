@@ -14,7 +14,7 @@ from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.models.registry.entries import answering_version
 from traps_pipeline.models.registry.judges import panel_version
 from traps_pipeline.models.registry.prompts import prompt_version
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Records, StudyFile
 from traps_pipeline.pipeline.schemes import CELL, EVALUATION, by_dataset, by_evaluation
@@ -63,7 +63,7 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     """Return metadata: items without an answer, and the explorer's view of all."""
     view = answers_view(dataset=cell.dataset, model=cell.evaluation.model, regime=cell.evaluation.regime)
     columns = ("item_id", "side", "outcome", "error", "attempts")
-    unanswered = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
+    unanswered = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED_OUTCOMES]
     records = [{name: str(getattr(row, name)) for name in columns} for row in unanswered[:ITEMS_SHOWN]]
     table = {"without an answer": Records(records)} if records else {}
     reason = {"one item": f"traps why {rows[0].item_id}"} if rows else {}

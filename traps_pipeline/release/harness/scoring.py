@@ -10,7 +10,7 @@ from typing import Any
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.reading.interpret import read_answer
 from traps_pipeline.models.reading.judged_answers import UNREAD, is_correct
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.protocol.two_events import lane_item, lane_items
 
@@ -54,7 +54,7 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
     row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
     reading = read_answer({**row, "text": text}, None, regime)
     names = {name: item[name] for name in ("item_id", "dataset", "side")}
-    if reading.outcome not in JUDGED or reading.text is None:
+    if reading.outcome not in JUDGED_OUTCOMES or reading.text is None:
         return PanelDecision(**names, outcome=reading.outcome)
     statement = read_statement(reading.text, item["question"])
     if statement is None:

@@ -14,7 +14,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.base.yamlfile import read_lines
-from traps_pipeline.models.registry.entries import PROTOCOL
+from traps_pipeline.models.registry.entries import PROTOCOL_PARAMS
 from traps_pipeline.models.registry.judges import RULES_PANEL, panel_id
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
@@ -76,7 +76,7 @@ def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS
         "panel": panel_id(RULES_PANEL),
         "media": media.model_dump(mode="json", exclude_none=True),
         "prompts": {row["name"]: row["text"] for row in prompts if row["role"] == SYSTEM and _is_of_text(row["name"])},
-        "parameters": {name: value for name, (_, value) in PROTOCOL.items()},
+        "parameters": {name: value for name, (_, value) in PROTOCOL_PARAMS.items()},
         "items": digest(sorted(items)),
     }
     write_text(package / ABOUT, json.dumps(description, indent=1, ensure_ascii=False) + "\n")

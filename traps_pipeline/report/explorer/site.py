@@ -26,7 +26,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.people.recorded_certificates import certification_note, recorded_verdicts
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, UNPAIRED, sides_of
@@ -221,7 +221,7 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "models": [{"id": m, "group": registry[m].groups.group if m in registry else unknown} for m in models],
         "evaluations": evaluations,
         "outcomes": [*answers.outcomes],
-        "judged": [*JUDGED],
+        "judged": [*JUDGED_OUTCOMES],
         "epochs": [*answers.epochs],
         "shards": shards,
         "n_votes": len(answers.votes),
