@@ -18,7 +18,7 @@ from traps_pipeline.mechanism.gate import (
     SOURCES,
     THRESHOLDS,
     Decisions,
-    Items,
+    GateItems,
     Outcomes,
     families,
     gate_answers,
@@ -88,7 +88,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return all items as `gate.Items.table`, in the order of `states.items`."""
+    """Return all items as `gate.GateItems.table`, in the order of `states.items`."""
     items = states.items
     id_columns = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     table = id_columns.assign(family=families(items), prompt=items["states_key"])
@@ -145,7 +145,7 @@ def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates) -> Gated
     return decisions
 
 
-def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
+def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> GateItems:
     """Return the table with features; if shuffled, scenarios swap sides at random."""
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
     for name, rows in features.items():
@@ -153,7 +153,7 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
     if shuffled:
         void = swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
         table = table.assign(void=void)
-    return Items(table, values)
+    return GateItems(table, values)
 
 
 def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:

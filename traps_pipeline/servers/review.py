@@ -25,7 +25,7 @@ from traps_pipeline.report.explorer.scenario_words import answer_of_control, cer
 from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect
 from traps_pipeline.servers.duplicates import Comparison
 from traps_pipeline.servers.queue import MEANINGS, QUEUES, QueueName, flags, queue
-from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page, script, study_file
+from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page_html, script, study_file
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -209,7 +209,7 @@ class Review:
                 "twin": f"Twin, {void} void: {json.loads(spec['twin'])['ground_truth']}",
             },
         }
-        return page(
+        return page_html(
             "review.html.j2",
             shown=fields,
             queue=name,
@@ -229,7 +229,7 @@ class Review:
 
     def done_page(self, name: QueueName) -> str:
         """Return a queue's last page: the decisions' effect, and the next commands."""
-        return page(
+        return page_html(
             "review_done.html.j2",
             effect=self.summary(),
             queue=name,

@@ -26,7 +26,7 @@ from traps_pipeline.report.tables.table_columns import (
     entries,
     epochs,
     frame,
-    marks,
+    mark_notes,
     no_overall,
     rightly_empty,
     sort_rows,
@@ -67,7 +67,7 @@ def visual_textual(results: Results) -> list[PrintedTable]:
         epochs(rates.assign(dataset=rates["model"])),
         "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
         "pooled: means over both taxonomies, and their ratio",
-        *marks(rates),
+        *mark_notes(rates),
         *([] if results.is_study else ["gaps of the printed, rounded rates"]),
         *results.refused.get("rates", []),
     ]
@@ -123,7 +123,7 @@ def uplift(results: Results) -> list[PrintedTable]:
         *COUNT_COLUMNS,
     ]
     notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0"]
-    notes += [*marks(table), *refusals]
+    notes += [*mark_notes(table), *refusals]
     absence = "no model has standard and guided on all four datasets"
     return [PrintedTable("guided_uplift", "Guided against standard", table, columns, notes, absence, _regime_trace)]
 
@@ -147,7 +147,7 @@ def naive(results: Results) -> list[PrintedTable]:
         f"guided; Naive = Acc × AbsRec of the means over runs; {len(gap_cells)} of {len(rows)} cells differ by more "
         f"than {NAIVE_THRESHOLD}",
         epochs(cells),
-        *marks(rows),
+        *mark_notes(rows),
     ]
     return [
         PrintedTable(
@@ -163,7 +163,7 @@ def zero_boundary(results: Results) -> list[PrintedTable]:
     n_cells = results.cells.groupby("regime", sort=False).size()
     zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
     notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in n_cells.items()), epochs(rows)]
-    notes += marks(rows)
+    notes += mark_notes(rows)
     reason = "no cell has PECS 0" if len(results.cells) else results.why("cells")
     table = PrintedTable("zero_boundary", "Cells with PECS 0", rows, columns, notes, reason, cell_trace)
     return [rightly_empty(table, bool(len(results.cells)))]
@@ -173,7 +173,7 @@ def frontier(results: Results) -> list[PrintedTable]:
     """Return the Pareto frontier in (Acc, J), averaged over datasets, by regime."""
     rows = sort_rows(with_marks(analyses.frontier(results.overall)), ["regime"])
     columns = [REGIME, MODEL, SHARE_COLUMNS[0], J, PECS, *COUNT_COLUMNS]
-    notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
+    notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *mark_notes(rows)]
     return [PrintedTable("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
 
 
@@ -203,7 +203,7 @@ def reasoning(results: Results) -> list[PrintedTable]:
         Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNT_COLUMNS,
     ]  # fmt: skip
     notes = [epochs(results.cells), "thinking minus other; Δ of shares in points; missing: items of both models"]
-    notes += [*marks(table), *refusals]
+    notes += [*mark_notes(table), *refusals]
     trace: Trace = lambda row, field: SourceItems(  # noqa: E731
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
@@ -232,7 +232,7 @@ def contrasts(results: Results) -> list[PrintedTable]:
     notes = ["left minus right; the other metrics and datasets are in the workspace's table `contrasts`"]
     if TOO_FEW in set(rows["separable"]):
         notes.append(f"{TOO_FEW}: no answers to so few scenarios could differ significantly")
-    notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
+    notes += ["missing: items of both sides", *mark_notes(rows)] if len(rows) else []
     trace: Trace = lambda row, field: SourceItems("", row["left_model"], row["left_regime"])  # noqa: E731
     reason = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
     return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, reason, trace)]
@@ -293,7 +293,7 @@ def degenerate(results: Results) -> list[PrintedTable]:
             *COUNT_COLUMNS,
         ]
         notes.append("measured: overall, standard; PECS clips J at 0, so chance alone lifts a random strategy above 0")
-        notes += marks(rows)
+        notes += mark_notes(rows)
     trace: Trace = lambda row, field: (  # noqa: E731
         SourceItems("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
     )

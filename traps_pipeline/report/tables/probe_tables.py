@@ -26,7 +26,7 @@ from traps_pipeline.report.tables.inside_columns import (
     few_note,
     interval,
     short_names,
-    why,
+    why_not,
 )
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
@@ -143,7 +143,9 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
         *few_note(rows),
     ]
     title = "Probe transfer: AUROC by ordered pair"
-    return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
+    return PrintedTable(
+        "probe_transfer", title, rows, columns, notes, why_not(results), dash=WHY_UNSHARED, deviation=DRAWS
+    )
 
 
 def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
@@ -164,7 +166,7 @@ def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         *baseline_notes(results),
         *few_note(rows, "cf_mark"),
     ]
-    reason = why(results, "the paper has these numbers in its table of probe transfer")
+    reason = why_not(results, "the paper has these numbers in its table of probe transfer")
     if results.is_study and len(results.probes):
         reason = "; ".join(gap_notes) or reason
     title = "Probes on confabulated voids (Cf→Cf)"
@@ -201,7 +203,9 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
         ]  # fmt: skip
         notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
     title = "Probe transfer: means over paths"
-    return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
+    return PrintedTable(
+        "probe_means", title, rows, columns, notes, why_not(results), dash=WHY_UNSHARED, deviation=DRAWS
+    )
 
 
 def _names_by_frequency(names: pd.Series) -> str:
@@ -263,7 +267,7 @@ def _within_table(results: Results) -> PrintedTable:
         "Probes within a dataset",
         "± standard deviation over shuffles of labels, or over draws of noise",
     )
-    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=spread_note)
+    return PrintedTable("probe_within", title, table, columns, notes, why_not(results), deviation=spread_note)
 
 
 def _catch(results: Results) -> PrintedTable:
@@ -291,7 +295,7 @@ def _catch(results: Results) -> PrintedTable:
             "of a baseline are its own",
         ]
     notes += few_note(table)
-    return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why(results))
+    return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why_not(results))
 
 
 def _caught_columns() -> Iterator[Column]:

@@ -14,7 +14,7 @@ from traps_pipeline.report.tables.table_columns import (
     SHARE_COLUMNS,
     N,
     epochs,
-    marks,
+    mark_notes,
     with_marks,
     with_titles,
 )
@@ -87,7 +87,7 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
     count_columns = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
     if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in count_columns.values()):
         columns += [Column(name, f"Models, {words}", "count") for words, name in count_columns.items()]
-    notes += marks(rows)
+    notes += mark_notes(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
     return PrintedTable(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
 

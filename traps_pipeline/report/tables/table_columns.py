@@ -14,7 +14,7 @@ from traps_pipeline.protocol.datasets import DATASETS, SHORT, TWO_EVENTS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
+from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLE_OF
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, fraction
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def with_marks(rows: pd.DataFrame) -> pd.DataFrame:
 
 def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with `title`, the printed name of the dataset."""
-    return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
+    return rows.assign(title=rows.loc[:, "dataset"].map(TITLE_OF))
 
 
 def combined_counts(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def entries(results: Results) -> pd.DataFrame:
     return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
 
 
-def marks(rows: pd.DataFrame) -> list[str]:
+def mark_notes(rows: pd.DataFrame) -> list[str]:
     """Return the meanings of the marks in these rows."""
     return meanings(rows["mark"])
 
