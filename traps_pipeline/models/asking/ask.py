@@ -16,7 +16,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
-from traps_pipeline.ledger.rows import settles
+from traps_pipeline.ledger.rows import is_settled
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.asking.draining import drain_on_interrupt
 from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, ask_once, ledger_row
@@ -161,7 +161,7 @@ class _Asking:
             return False
         outcome = attempt_result[0] if self.again is None else self.again(attempt_result[0])
         row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
-        progress.current().called(name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
+        progress.current().called(name, not is_settled(row), row["latency_s"], row["cost_usd"] or 0.0)
         if self.again is None:
             participant.breaker.watch(outcome)
         return True
@@ -276,7 +276,7 @@ async def _settle_cell(
     if stop.is_set():
         return None
     await its.writer.sync()
-    errors = sum(not settles(row) for row in rows.values())
+    errors = sum(not is_settled(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(requests) - len(missing), errors=errors)
     return SettledCell(cell, calls, {key: rows[key] for key in requests}, tally)
 
