@@ -262,8 +262,7 @@ class Progress:
         if self.is_stopping:
             return f"{now.name}: {self.waiting()}"
         total, parts = now.total(), [f"{now.done:,} of {now.partitions:,} made"] if now.partitions else []
-        if now.detail:
-            parts.append(now.detail)
+        parts += [now.detail] if now.detail else []
         if total.wanted:
             parts.append(f"{total.done:,} of {count_noun(total.wanted, 'call')}")
             if total.sent_at:

@@ -132,17 +132,13 @@ class LaneScenario:
     @cached_property
     def spec(self) -> TwoEventsSpec:
         """The corrected record. Raises TrapsError if the words do not fit."""
-        if not self.words:
-            return self.record.spec
-        try:
-            return type(self.record.spec).model_validate(self.record.spec.model_dump(mode="json") | dict(self.words))
-        except ValidationError as error:
-            raise TrapsError(
-                f"{self.where}: {self.record.scenario_id}: {faults_of(error)}; correct that line"
-            ) from error
+        return apply_words(self.record.spec, self.words, self.where)
 
 
-def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
+_Spec = TypeVar("_Spec", SceneSpec, TwoEventsSpec)
+
+
+def apply_words(spec: _Spec, words: Mapping[str, Any], where: str) -> _Spec:
     """Return a record with corrected words. Raises TrapsError if labels do not fit."""
     if not words:
         return spec
@@ -151,7 +147,7 @@ def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneS
         record["ground_truth"] = words["answer"]
         record["evidence"] = record["evidence"] | {"answer_from": "correction"}
     try:
-        return SceneSpec.model_validate(record)
+        return type(spec).model_validate(record)
     except ValidationError as error:
         raise TrapsError(f"{where}: {spec.scenario_id}: {faults_of(error)}; correct that line") from error
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -252,14 +253,11 @@ def _wrong_votes(
     submission: Submission, votes: Sequence[Row], answers: Sequence[Row], items: Mapping[str, Row]
 ) -> Iterator[str]:
     seats = {seat.id: seat for seat in submission.about.judges}
-    texts = {
-        (row["item_id"], row["model"], row["regime"], row["run"]): row
-        for row in answers
-        if row["outcome"] in JUDGED_OUTCOMES
-    }
+    key_of = itemgetter("item_id", "model", "regime", "run")
+    texts = {key_of(row): row for row in answers if row["outcome"] in JUDGED_OUTCOMES}
     cast = dict[tuple[Any, ...], set[tuple[str, str]]]()
     for row in votes:
-        key = (row["item_id"], row["model"], row["regime"], row["run"])
+        key = key_of(row)
         answer, item, seat = texts.get(key), items.get(row["item_id"]), seats.get(row["judge"])
         if answer is None or item is None or seat is None or row["task"] not in tasks_for(item["side"]):
             yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_row_name(row)}: there is nothing to judge"

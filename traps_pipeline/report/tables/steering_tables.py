@@ -163,9 +163,8 @@ def _top(results: Results) -> PrintedTable:
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
     rows = _with_names(rows)
     columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, ALPHA, *_in_gaps(results), *_SIDES, *_counts(results)]
-    return PrintedTable(
-        "steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why_not(results)
-    )
+    notes = _cell_notes(results)
+    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, notes, why_not(results))
 
 
 def _dose(results: Results) -> PrintedTable:
