@@ -135,7 +135,7 @@ class LaneScenario:
         return apply_words(self.record.spec, self.words, self.where)
 
 
-_Spec = TypeVar("_Spec", SceneSpec, TwoEventsSpec)
+_Spec = TypeVar("_Spec", SceneSpec, "TwoEventsSpec")
 
 
 def apply_words(spec: _Spec, words: Mapping[str, Any], where: str) -> _Spec:
