@@ -384,7 +384,7 @@ def test_whatever_a_check_raises_refuses_its_file_in_a_sentence(
     def surprise(*_: object) -> object:
         raise RecursionError("deep")
 
-    monkeypatch.setattr("traps_pipeline.release.verification.decide", surprise)
+    monkeypatch.setattr("traps_pipeline.release.verification.verdicts_of", surprise)
     with raises(TrapsError, "release.verification.verify_file", str(packed), "RecursionError"):
         verify_file(packed)
 

@@ -152,7 +152,7 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
         place = "" if path == JUDGES_FILE else f"{path}: "  # an experiment names its own file and line
         raise TrapsError(f"{place}no panel {name!r}; there are {', '.join(panels)}{did_you_mean(name, panels)}")
     seats = panels[name]
-    own_files = [file for file, own in user_registry.sources() if name in own.panels] if path == JUDGES_FILE else []
+    own_files = [file for file, own in user_registry.registries() if name in own.panels] if path == JUDGES_FILE else []
     path = own_files[-1] if own_files else path
     is_valid = isinstance(seats, list) and len(seats) == len(set(seats)) and len(seats) in PANEL_SIZES
     if not is_valid or any(seat not in judges for seat in seats):

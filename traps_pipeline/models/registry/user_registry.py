@@ -112,16 +112,16 @@ def save_entries(workspace: Workspace) -> None:
         clear_caches()
 
 
-def user_registries() -> list[tuple[Path, UserRegistry]]:
+def registries() -> list[tuple[Path, UserRegistry]]:
     """Return all additions, each with its file: the workspace's, the experiment's."""
     path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
     return [*([(path, _read(path))] if path else []), *_overlay]
 
 
 def all_additions() -> UserRegistry:
-    """Return the union of all `user_registries`."""
+    """Return the union of all `registries`."""
     registry_union = UserRegistry()
-    for _, registry in user_registries():
+    for _, registry in registries():
         registry_union |= registry
     return registry_union
 
@@ -133,7 +133,7 @@ def accounts() -> Mapping[str, dict[str, Any]]:
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
     """Return the added models or judges, completed, each with its file."""
-    newest_of = {raw["id"]: (path, raw) for path, registry in user_registries() for raw in getattr(registry, kind)}
+    newest_of = {raw["id"]: (path, raw) for path, registry in registries() for raw in getattr(registry, kind)}
     return ((path, _entry_fields(raw, kind)) for path, raw in newest_of.values())
 
 
