@@ -17,7 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.yamlfile import check_line, explain, read_unchecked_lines
+from traps_pipeline.base.yamlfile import check_line, faults_of, read_unchecked_lines
 from traps_pipeline.scenes.worlds.spec import Slug
 
 TABLES = ("pairs.csv", "pairs.jsonl")
@@ -131,7 +131,7 @@ def read_pairs(folder: Path) -> tuple[list[RecordedPair], list[str]]:
                 raise ValueError(f"id {pair.id!r} stands there twice")
             pairs[pair.id] = pair
         except ValueError as error:
-            reason = explain(error, RecordedPair) if isinstance(error, ValidationError) else str(error)
+            reason = faults_of(error, RecordedPair) if isinstance(error, ValidationError) else str(error)
             problems.append(f"{where}: {reason}; correct that line")
     return [*pairs.values()], problems
 

@@ -13,7 +13,7 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
+from traps_pipeline.mechanism.gate import THRESHOLDS, GateItems, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.layer_choice import pair_curves
 from traps_pipeline.mechanism.lens import lens_rows
@@ -28,7 +28,7 @@ from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import DATASETS, EXTRACTED, dataset_of
 from traps_pipeline.protocol.regimes import VQA_PROMPTS
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def prompt(
     items = opened.tables.read(PROBE_ITEMS, {"dataset": dataset_of(item)}).set_index("item_id")
     check_name("item", item, items.index)
     assert entry.media is not None, "local entries have media"
-    frames = sample(opened.resolve(str(items.at[item, "clip"])), entry.media)
+    frames = pick_frames(opened.resolve(str(items.at[item, "clip"])), entry.media)
     text = states_prompt(system or opened.mechanism.system, regime)
     return load_model(opened, entry.id).prompt(text, str(items.at[item, "question"]), frames.frames, frames.times_s)
 
@@ -263,7 +263,7 @@ def gate(
     return Gate(layer, probe, cuts[threshold], pooling)  # pyright: ignore[reportArgumentType]
 
 
-def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:
+def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> GateItems:
     table = gate_table(states)
     datasets = [name for name in DATASETS if name in set(table["dataset"])]
     names = sources_of_gate(source, target, datasets)

@@ -20,7 +20,7 @@ from traps_pipeline.report.tables.inside_columns import (
     joined_notes,
     path_names,
     short_names,
-    why,
+    why_not,
 )
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable, fraction
@@ -61,7 +61,7 @@ def _nulls(results: Results) -> PrintedTable:
         "(1 + draws), one-sided, not corrected for the number of rows",
         *few_note(table_rows),
     ]
-    reason = why(results, "the paper has no such nulls")
+    reason = why_not(results, "the paper has no such nulls")
     return PrintedTable("steering_nulls", "Void directions among their nulls", table_rows, columns, notes, reason)
 
 
@@ -97,7 +97,7 @@ def _pecs(results: Results) -> PrintedTable:
         "degenerate: cut off, a phrase four times in a row, or another script or language than the unsteered answer",
         *few_note(table_rows),
     ]
-    reason = why(results, "the paper prints no correctness of steered answers")
+    reason = why_not(results, "the paper prints no correctness of steered answers")
     return PrintedTable("steering_pecs", "PECS of the steered model", table_rows, columns, notes, reason)
 
 
@@ -150,7 +150,7 @@ def gate(results: Results) -> list[PrintedTable]:
         *joined_notes(rows),
         *few_note(rows),
     ]
-    reason = why(results, "the paper gates nothing")
+    reason = why_not(results, "the paper gates nothing")
     return [PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, reason)]
 
 
@@ -219,7 +219,7 @@ def leads(results: Results) -> PrintedTable:
         notes.append(
             f"{model} under {regime}, PECS {fraction(part['plain_pecs'].iloc[0])} without a gate; gated on {figures}"
         )
-    reason = why(results, "the paper has no such rivals")
+    reason = why_not(results, "the paper has no such rivals")
     return PrintedTable(
         "leads", "States and their rivals, in the model and in its controls", rows, columns, notes, reason
     )
