@@ -70,7 +70,7 @@ def interaction() -> pd.DataFrame:
         at |= {"auroc": auroc, "within": within, "confound": 0.95, "own_effect": 1.0, "other_effect": 0.0}
         others = ({"layer": 4, "chosen": False}, {"held_out": "scenarios"})
         rows += [at, *(at | other | {"auroc": 1.0, "within": 1.0} for other in others)]
-        rows.append(at | {"features": "words", "layer": -1, "auroc": 0.5, "within": 0.5, "ties": 1.0})
+        rows.append(at | {"features": "words", "layer": -1, "auroc": 0.5, "within": 0.5, "same": 1.0})
     return frame(INTERACTION, *rows)
 
 

@@ -49,7 +49,7 @@ def test_what_clip_and_question_tell_apart_adds_up_to_chance_within_every_clip()
     noise = np.random.default_rng(0).standard_normal((DESIGN.clips.max() + 1, 5))[DESIGN.clips]
     found = figures(np.column_stack([questions, noise]), "scenarios")
     assert (found["within"], found["auroc"]) == (0.5, pytest.approx(0.5, abs=0.02))
-    assert found["ties"] == 0 and figures(noise, "scenarios")["ties"] == 1  # what is of the clip alone
+    assert found["same"] == 0 and figures(noise, "scenarios")["same"] == 1  # what is of the clip alone
 
 
 def test_families_are_not_held_out_where_there_is_one() -> None:

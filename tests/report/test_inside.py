@@ -94,7 +94,7 @@ def test_the_first_claim_is_the_interaction_at_the_chosen_layer_with_families_he
         ({"within": 0.9}, "holds"),  # the AUROC of random weights and of rivals is at chance
         ({"auroc": 0.9, "within": rows["within"].where(is_rival, 0.9)}, "holds in random 0 too"),
         ({"auroc": 0.9, "within": rows["within"].mask(is_rival, 0.9)}, "holds in best rival too"),
-        ({"ties": rows["ties"].mask(rows["prompt"] == "random_0", 1.0)}, "no control"),
+        ({"same": rows["same"].mask(rows["prompt"] == "random_0", 1.0)}, "no control"),
     ):
         made.interaction = rows.assign(**changed)
         assert claim_frame(made)["verdict"].iloc[0] == expected

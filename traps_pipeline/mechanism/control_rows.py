@@ -217,7 +217,7 @@ class InteractionRow(JoinedColumns):
     within: Annotated[float, "share of these clips whose hidden event's question is scored above the other one"]
     within_low: Chance
     within_high: Chance
-    ties: Annotated[float, "share of these clips with one score under both questions; 1: features do not vary"]
+    same: Annotated[float, "share of these clips with the same features under both questions"]
     confound: Annotated[float, "AUROC of the same probe over all eight items: the number of boards tells; no claim"]
     own_effect: Annotated[float, "rise of the score from no event hidden to the asked one alone, in its deviations"]
     other_effect: Annotated[float, "the same to the other one alone"]

@@ -112,7 +112,8 @@ def figures_of(
             "within": float(won.mean()), "within_low": within_low, "within_high": within_high,
             "confound": float(auroc(design.asked, _unseen_scores(features, design.asked, fold_of, fold_of >= 0))),
             "own_effect": float(asked - neither), "other_effect": float(other - neither),
-            "ties": float((won == 0.5).mean()), "n_clips": len(won), "n_scenarios": len(np.unique(design.scenarios)),
+            "same": _same_features(features[one_hidden], design.clips[one_hidden]),
+            "n_clips": len(won), "n_scenarios": len(np.unique(design.scenarios)),
         }  # fmt: skip
     return result
 
@@ -124,6 +125,12 @@ def _unseen_scores(features: np.ndarray, label: np.ndarray, folds: np.ndarray, f
         train = (folds != fold) & fitted
         scores[folds == fold] = fit_probe(features[train], label[train]).scores(features[folds == fold])
     return scores.round(DECIMALS)
+
+
+def _same_features(features: np.ndarray, clips: np.ndarray) -> float:
+    """Return the share of clips whose features are the same under both questions, but for rounding."""
+    rounding = 1e-6 * np.abs(features).max()
+    return float(np.mean([np.ptp(features[clips == clip], axis=0).max() <= rounding for clip in np.unique(clips)]))
 
 
 def _within_clips(

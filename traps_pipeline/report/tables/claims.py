@@ -230,7 +230,7 @@ def _interaction(results: Results, model: str, subject: str) -> float | None:
     rows = rows.loc[(rows["model"] == model) & (rows["prompt"] == (subject if subject in RANDOM else GUIDED))]
     rows = rows.loc[(rows["held_out"] == "families") & rows["chosen"].eq(True)]
     rows = rows.loc[rows["features"].ne(STATES) if subject == RIVAL else rows["features"].eq(STATES)]
-    figures = rows[["auroc", "within"]].min(axis=1).where(rows["ties"].ne(1) | rows["features"].ne(STATES))
+    figures = rows[["auroc", "within"]].min(axis=1).where(rows["same"].ne(1) | rows["features"].ne(STATES))
     return None if subject == PLACEBO or rows.empty else float(figures.max())
 
 
