@@ -114,8 +114,9 @@ def test_a_row_that_joins_two_models_is_left_out_of_claims() -> None:
 
 def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
     (sources,) = control_reports.gate(Made())
-    assert [row["Target"] for row in cells(sources)] == ["all", "ch"]
-    assert [(row["Controls"], row["Voids"]) for row in cells(sources)] == [("64", "64")] * 2
+    found = [(row["Gate on"], row["Target"]) for row in cells(sources)]
+    assert found == [("states", "all"), ("states", "ch"), ("question words", "all")]
+    assert [(row["Controls"], row["Voids"]) for row in cells(sources)] == [("64", "64")] * 3
 
 
 def test_what_the_prompt_changes_is_measured_in_answers_and_in_states() -> None:

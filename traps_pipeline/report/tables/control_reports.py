@@ -23,7 +23,7 @@ from traps_pipeline.report.tables.inside_columns import (
     why_not,
 )
 from traps_pipeline.report.tables.table_columns import MODEL
-from traps_pipeline.report.writing import Column, PrintedTable, fraction
+from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -121,27 +121,23 @@ _GATE_NOTES = (
 )
 
 
-def _gates(results: Results) -> pd.DataFrame:
-    """Return gate rows; states, other datasets, mid threshold, all datasets first."""
+def gate(results: Results) -> list[PrintedTable]:
+    """Return PECS before and after gates by source and threshold on states, and of all features by the default gate."""
     rows = results.gate
-    first_values = {"features": "states", **DEFAULT_GATE, "target": "all"}
+    first_values = {"features": STATES, **DEFAULT_GATE, "target": "all"}
     is_later = {f"{name}_later": rows[name].astype(object) != first for name, first in first_values.items()}
     rows = rows.assign(**is_later).sort_values(["model", "regime", *is_later], kind="stable", ignore_index=True)
-    return rows.assign(
+    is_default = ~rows[[f"{name}_later" for name in first_values if name != "features"]].any(axis=1)
+    rows = rows.loc[is_default | (rows["features"] == STATES) & rows["target"].isin([*SHORT, "all"])]
+    rows = rows.assign(
         mark=few_marks(rows, "n_controls", "n_voids"),
         layer=rows["layer"].where(rows["layer"] >= 0),  # a mean over datasets has no layer of its own
         dataset=short_names(rows["target"]),
         sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
     ).drop(columns=[*is_later])
-
-
-def gate(results: Results) -> list[PrintedTable]:
-    """Return PECS before and after gates, by source, threshold, features."""
-    rows = _gates(results)
-    rows = rows.loc[(rows["features"] == "states") & rows["target"].isin([*SHORT, "all"])]
     columns = [
-        MODEL, Column("regime", "Answers"), Column("sources", "Gate from"), Column("threshold", "Threshold"),
-        Column("dataset", "Target"), LAYER, *_GATED,
+        MODEL, Column("regime", "Answers"), Column("features", "Gate on"), Column("sources", "Gate from"),
+        Column("threshold", "Threshold"), Column("dataset", "Target"), LAYER, *_GATED,
     ]  # fmt: skip
     notes = [
         *_GATE_NOTES,
@@ -207,18 +203,7 @@ def leads(results: Results) -> PrintedTable:
         Column("lead_high", "to", "fraction"), Column("n_voids", "Voids", "count"),
         Column("n_controls", "Controls", "count"),
     ]  # fmt: skip
-    gates = results.gate
-    gates = gates.loc[
-        (gates["source"] == "other datasets") & (gates["threshold"] == "mid") & (gates["target"] == "all")
-    ]
     notes = ["AUROC of voids against controls, by probes of the other datasets that have not seen the scenario"]
-    for (model, regime), part in gates.groupby(["model", "regime"], observed=True, sort=False):
-        figures = ", ".join(
-            f"{name} {fraction(value)}" for name, value in zip(part["features"], part["pecs"], strict=True)
-        )
-        notes.append(
-            f"{model} under {regime}, PECS {fraction(part['plain_pecs'].iloc[0])} without a gate; gated on {figures}"
-        )
     reason = why_not(results, "the paper has no such rivals")
     return PrintedTable(
         "leads", "States and their rivals, in the model and in its controls", rows, columns, notes, reason
