@@ -98,7 +98,7 @@ def _claim_row(ax: Axes, y: int, row: Mapping[Any, Any], claim: Claim) -> None:
         face = (VOID if must_fail else HOLDS if subject == MODEL else GRID) if reaches else "white"
         edge = INK if must_fail and is_known else GRID
         ax.add_patch(Rectangle((x - 0.44, y - 0.42), 0.88, 0.84, facecolor=face, edgecolor=edge, linewidth=0.7))
-        look: dict[str, Any] = {"size": 6.5, "color": INK} if is_known else {"size": 4.8, "color": SOFT}
+        look: dict[str, Any] = {"size": 6.5, "color": INK} if is_known else {"size": 4.4, "color": SOFT}
         ax.text(x, y, fraction(figure, 2) if is_known else row[f"why_{subject}"], ha="center", va="center", **look)
     held = row["verdict"] == "holds"
     ax.text(len(SUBJECTS), y, f"{claim.bound:g}", ha="center", va="center", size=6.5, color=SOFT)
