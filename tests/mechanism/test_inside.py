@@ -21,7 +21,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from tests.build.errors import raises
-from tests.build.mechanism import STANDARD, entry, patch
+from tests.build.mechanism import STANDARD, entry, extract_all, patch
 from tests.build.mechanism import study as extracted
 from tests.mechanism.study import PAIRS, write_verdicts
 from tools.inside_notebook import NOTEBOOK, execute
@@ -40,6 +40,7 @@ from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.prompts import system_prompt, vqa_prompt
+from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.storage.media import pick_frames
 from traps_pipeline.storage.workspace import Workspace
 
@@ -53,6 +54,7 @@ def study(extracted: Workspace) -> Workspace:
     """Extracted, with directions and probes, and judged on one dataset."""
     write_verdicts(extracted, "chaotic", {f"plinko-{n}": n < 2 for n in range(PAIRS)})
     extracted.tables.write(PROBES, STANDARD.partition, stages.probe_rows(extracted, STANDARD), {})
+    extract_all(extracted, ["occlusion"], Extraction("tiny", "guided"))
     return extracted
 
 
@@ -228,7 +230,7 @@ def test_no_repr_prints_an_array(study: Workspace, entry: ModelEntry) -> None:
         (lambda study: inside.prompt(study, "chaotic:plinko-0:void", system="qva"), ("qva",)),
         (lambda study: inside.load(study, "tinny"), ("tinny", "tiny")),
         (lambda study: inside.load(study, "pocket"), ("pocket", "tiny")),
-        (lambda study: inside.load(study, "tiny", prompt="guided"), ("guided", "standard")),
+        (lambda study: inside.load(study, "tiny", prompt="gided"), ("gided", "guided")),
         (lambda study: inside.load(study, "tiny", layer=9), ("9", "normed")),
         (lambda study: inside.load(study, "tiny", layer="norm"), ("norm", "normed")),
         (lambda study: inside.load(study, "tiny", datasets=["caotic"]), ("caotic", "chaotic")),

@@ -13,7 +13,7 @@ def test_every_cell_of_the_notebook_was_run_as_it_stands_and_keeps_what_it_print
     written = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
     code = [cell for cell in written["cells"] if cell["cell_type"] == "code"]
     pictures = [output for cell in code for output in cell["outputs"] if output["output_type"] == "display_data"]
-    assert all(cell["outputs"] for cell in code) and len(pictures) >= 3
+    assert all(cell["outputs"] for cell in code) and len(pictures) >= 2
     assert [cell["execution_count"] for cell in code] == [*range(1, len(code) + 1)]
     changed = [cell["source"][0] for cell in written["cells"] if cell["id"] != identity(cell["source"])]
     assert not changed, "cells were changed: run `python -m tools.inside_notebook`"
