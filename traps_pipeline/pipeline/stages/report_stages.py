@@ -32,7 +32,7 @@ def _parents(*names: str) -> list[Parent]:
     return [dep(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
 
 
-@_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
+@_stage("report_page", parents=_parents(*ANSWERS, *SCORES, *_REPORTED, "published"))
 def report_page(workspace: Workspace, _: None) -> StageOutput:
     """Return findings, leaderboard, figures and tables beside the paper's on one page.
 
