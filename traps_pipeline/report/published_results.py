@@ -53,11 +53,6 @@ def _rates(results: Results) -> pd.DataFrame:
     return table.reindex(columns=pd.Index(RATE_COLUMNS))
 
 
-def _empty_frame(*columns: str) -> pd.DataFrame:
-    """Return a frame without rows, for what the paper's tables do not determine."""
-    return pd.DataFrame(columns=pd.Index(columns))
-
-
 def _sub_scenarios(results: Results) -> pd.DataFrame:
     occlusion, chaotic = published("occlusion_subscenarios"), published("chaotic_subscenarios")
     table = concat_frames([occlusion.assign(dataset="occlusion"), chaotic.assign(dataset="chaotic")])
@@ -136,13 +131,8 @@ class PublishedResults(Results):
     cells = cached_property(_cells)
     overall = cached_property(_overall)
     rates = cached_property(_rates)
-    sub_cells = cached_property(
-        lambda results: _empty_frame("model", "dataset", "regime", "scope", "abs_rec", "n_pairs")
-    )
     sub_scenarios = cached_property(_sub_scenarios)
-    labels = cached_property(lambda results: _empty_frame("dataset", "sub_scenario", "label", "acc"))
     confabulation = cached_property(_confabulation)
-    composition = cached_property(lambda results: _empty_frame("taxonomy", "category", "void", "n", "n_ill_posed"))
     probes = cached_property(_probes)
     cosines = cached_property(_cosines)
     effects = cached_property(_effects)

@@ -1,7 +1,7 @@
 """Write tables and figures in all formats, with the same bytes on every build.
 
-A `PrintedTable` is a frame of numbers with printed columns; it becomes Parquet and CSV (unrounded numbers), LaTeX,
-Markdown, text for a terminal and HTML (printed numbers). Its texts are untrusted: each medium escapes them.
+A `PrintedTable` is a frame of numbers with printed columns; it becomes CSV (unrounded numbers), LaTeX, Markdown,
+text for a terminal and HTML (printed numbers). Its texts are untrusted: each medium escapes them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ TEMPLATES = Path(__file__).parent / "templates"
 STYLE = ASSETS / "figures.mplstyle"
 NOT_RUN = "not run"
 REFERENCE_ROWS = "Reference rows"  # of strategies and rules, which no text calls models
-TABLE_KINDS = ("parquet", "csv", "tex", "md")
 FIGURE_KINDS = ("pdf", "svg", "png")
 
 COLUMN_IN, PAGE_IN = 3.3, 6.8  # widths of a figure of one column, and of two
@@ -224,14 +223,12 @@ class PrintedTable:
 
 
 def table_files(table: PrintedTable) -> dict[str, bytes]:
-    """Return the table as `name.parquet`, `.csv` (fractions), `.tex` and `.md`."""
-    files = {
-        "parquet": _parquet(table),
-        "csv": csv_bytes(table.data),
-        "tex": table_latex(table).encode(),
-        "md": table_markdown(table).encode(),
+    """Return the table as `name.csv` (fractions), `.tex` and `.md`."""
+    return {
+        f"{table.name}.csv": csv_bytes(table.data),
+        f"{table.name}.tex": table_latex(table).encode(),
+        f"{table.name}.md": table_markdown(table).encode(),
     }
-    return {f"{table.name}.{kind}": files[kind] for kind in TABLE_KINDS}
 
 
 def table_markdown(table: PrintedTable) -> str:
@@ -333,23 +330,6 @@ def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
 def markdown(text: object) -> str:
     """Return the text escaped as neither HTML nor markup, within its table cell."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
-
-
-def _parquet(table: PrintedTable) -> bytes:
-    """Return the Parquet file; text columns keep type text even if all is null."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    data = table.data
-    texts = {c.field for c in table.columns if c.unit in ("text", "range")}
-    object_columns = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
-    numeric = {name for name in object_columns if name not in texts and not any(isinstance(v, str) for v in data[name])}
-    data = data.astype({name: "Float64" if name in numeric else "string" for name in object_columns})
-    arrow = pa.Table.from_pandas(data, preserve_index=False)
-    metadata = {"title": table.title, "notes": "\n".join(table.remarks), "absence": table.absence}
-    stream = io.BytesIO()
-    pq.write_table(arrow.replace_schema_metadata(metadata), stream, compression="zstd")
-    return stream.getvalue()
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
