@@ -12,6 +12,7 @@ import yaml
 from tests.conftest import Checkout
 from tests.release.environments import run_in
 from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -26,7 +27,8 @@ def written(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: Checkout) -> None:
-    board = Workspace.open(small.workspace).tables.read_all(LEADERBOARD)
+    tables = Workspace.open(small.workspace).tables
+    board, n_items = tables.read_all(LEADERBOARD), len(tables.read_all(ITEMS))
     assert pq.read_table(written / "leaderboard.parquet").num_rows == len(board)
     for row in board.loc[board["dataset"] == "overall"].to_dict("records"):
         hub = yaml.safe_load((written / "eval_results" / f"{row['model']}.yaml").read_text())
@@ -35,6 +37,7 @@ def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: C
         (path,) = (written / "data" / "trapsbench" / "traps-pipeline" / row["model"]).iterdir()
         record = json.loads(path.read_text())
         scores = {one["evaluation_result_id"]: one["score_details"]["score"] for one in record["evaluation_results"]}
+        assert {one["source_data"]["samples_number"] for one in record["evaluation_results"]} == {n_items}
         for name in ("pecs", "acc", "abs_rec", "false_abs", "j"):
             assert scores[f"trapsbench/{row['regime']}/{name}"] == row[name]
 

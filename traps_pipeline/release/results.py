@@ -135,7 +135,7 @@ def _every_eval_results(row: Row, dataset: str, release: Release) -> Iterator[di
                 "source_type": "hf_dataset",
                 "hf_repo": dataset,
                 "hf_split": "test",
-                "samples_number": 2 * int(row["n_pairs"]),
+                "samples_number": int(row["n_items"]),
             },
             "metric_config": {
                 "evaluation_description": metric.meaning,
