@@ -50,14 +50,9 @@ RECORDED_LICENCE = (
     "Clips and words of each pair: as its importer states in the columns source, licence of metadata.jsonl."
 )
 # The hub's loader finds clips only below their table's folder: pairs name them from the top, items from clips/.
-PLACES: Mapping[str, str] = {
+PLACES: Mapping[str, str] = {table.name: f"{table.name}.jsonl" for table in OPEN} | {
     PAIRS.name: "metadata.jsonl",
     RELEASED_ITEMS.name: f"{CLIPS}/metadata.jsonl",
-    SCENARIOS.name: "scenarios.jsonl",
-    TWO_EVENTS_SCENARIOS.name: "two_events.jsonl",
-    CERTIFICATES.name: "certificates.jsonl",
-    SPLITS.name: "splits.jsonl",
-    PROMPTS.name: "prompts.jsonl",
 }
 
 
