@@ -24,7 +24,7 @@ from traps_pipeline.benchmark.held_out import (
 )
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
-from traps_pipeline.release.checksums import CHECKSUMS, write_checksums
+from traps_pipeline.release.checksums import CHECKSUMS, read_checksums, released_files, write_checksums
 from traps_pipeline.release.content import CLIPS, Content
 from traps_pipeline.release.croissant import croissant
 from traps_pipeline.release.held_out_clips import date_equally, write_held_out_clips
@@ -50,14 +50,9 @@ RECORDED_LICENCE = (
     "Clips and words of each pair: as its importer states in the columns source, licence of metadata.jsonl."
 )
 # The hub's loader finds clips only below their table's folder: pairs name them from the top, items from clips/.
-PLACES: Mapping[str, str] = {
+PLACES: Mapping[str, str] = {table.name: f"{table.name}.jsonl" for table in OPEN} | {
     PAIRS.name: "metadata.jsonl",
     RELEASED_ITEMS.name: f"{CLIPS}/metadata.jsonl",
-    SCENARIOS.name: "scenarios.jsonl",
-    TWO_EVENTS_SCENARIOS.name: "two_events.jsonl",
-    CERTIFICATES.name: "certificates.jsonl",
-    SPLITS.name: "splits.jsonl",
-    PROMPTS.name: "prompts.jsonl",
 }
 
 
@@ -127,8 +122,6 @@ def write_release(content: Content, target: Path, options: Options) -> ReleaseSu
 
 def _require_own(target: Path) -> None:
     """Raise TrapsError unless a folder is missing, empty, or a former release that may be replaced."""
-    from traps_pipeline.release.checksums import read_checksums, released_files
-
     if not (target / CHECKSUMS).is_file():
         if target.exists() and any(target.iterdir()):
             raise TrapsError(f"{target}: holds other files than a release; give an empty or a new folder")
@@ -183,7 +176,9 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
         folder.text(COMMITMENT, options.commitment.read_text(encoding="utf-8"))
     manifest = {
         "format": FORMAT,
-        **_description(content),
+        **content.release.model_dump(),
+        "versions": content.versions,
+        **({"recorded": True} if content.people else {}),
         "held_out": options.held_out is not None,
         "anonymous": options.anonymous,
         "date": options.date,
@@ -195,12 +190,6 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
     folder.text(DICTIONARY, dictionary(tables, PLACES, canary))
     folder.text(CARD, card(manifest, tables, PLACES))
     folder.text(CROISSANT, croissant(folder.root, manifest, tables, PLACES))
-
-
-def _description(content: Content) -> dict[str, Any]:
-    """Return name, version and canary of the release, and the version of each dataset."""
-    recorded = {"recorded": True} if content.people else {}
-    return {**content.release.model_dump(), "versions": content.versions, **recorded}
 
 
 # --- double-blind review ----------------------------------------------------------------------------------------------

@@ -70,7 +70,7 @@ LEGEND = {
     **{metric.heading: metric.meaning for metric in METRIC_WORDS.values()},
     "95 % CI": "interval of PECS, Bayesian bootstrap over scenarios with one unseen",
     "±": "population standard deviation over runs",
-    "n": "pairs (one control, one void) per run",
+    "n": "pairs (one control, one void; a held-out set asks one of both) per run",
     "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall metric is incomplete if that of "
     "any dataset is",
@@ -145,7 +145,7 @@ def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool
 def shortfall(board: pd.DataFrame) -> str:
     """Return why models lack answers, and what to change, in a sentence; empty if none lacks a fifth of them."""
     rows = board.loc[board["dataset"] != "overall"]
-    rows = rows.assign(asked=2 * rows["n_pairs"].astype(int) * rows["n_runs"].astype(int))
+    rows = rows.assign(asked=rows["n_items"].astype(int) * rows["n_runs"].astype(int))
     sums = rows.groupby("model", sort=False)[["asked", "n_missing"]].sum()
     models = [*sums.index[sums["n_missing"] > LACKING * sums["asked"]]]
     if not models:
@@ -256,7 +256,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         counted_rows = list(dataset_rows.values()) if main_row is None else [main_row]
         entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main_row or {})
         entry |= {name: _total(row[name] for row in counted_rows) for name in _SUMMED}
-        n_controls = sum(row["n_pairs"] * row["n_runs"] for row in counted_rows)
+        n_controls = sum(row["n_items"] * row["n_runs"] for row in counted_rows) / 2  # in a held-out set about half
         is_marked = (entry["n_overruled"] or 0) > OVERRULED_ABOVE * n_controls
         entry["overruled_mark"] = OVERRULED_MARK if is_marked else ""
         entry["mark"] = _mark(main_row) if main_row else ""

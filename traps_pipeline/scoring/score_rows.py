@@ -136,6 +136,7 @@ class LeaderboardRow(shared.EntryRow):
     dataset: DatasetOrOverall
     n_runs: Annotated[int, "runs averaged"]
     n_pairs: Annotated[int, "pairs per run"]
+    n_items: Annotated[int, "items per run: two a pair, but one of a held-out set"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     counts: Annotated[int, "over runs", EACH_COUNT]
     decisions: Annotated[int | None, "over runs", EACH_COUNT_OF_DECISIONS]

@@ -51,7 +51,6 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     sums[REJECTION_COLUMNS] = groups[REJECTION_COLUMNS].sum(min_count=1)
     board = means.join([deviations.add_suffix("_std"), sums])
     board["n_runs"] = groups["run"].nunique()
-    board["n_pairs"] = groups["n_pairs"].max()
     board["epoch"] = joined_in_groups(groups, "epoch", joined_epochs)
     board["panel"] = joined_in_groups(groups, "panel", joined_epochs)
     board["benchmark_version"] = joined_in_groups(groups, "benchmark_version", joined_versions)
@@ -59,6 +58,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board["incomplete"] = _spread_flags(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
     board["broken"] = board[[*BROKEN_COUNTS]].sum(axis=1) / board["n_items"]
     board["is_broken"] = _spread_flags(cast(pd.Series, board["broken"] > BROKEN_ABOVE))
+    board[["n_pairs", "n_items"]] = groups[["n_pairs", "n_items"]].max()  # of a run, where counts are over runs
     return board.reset_index()
 
 
