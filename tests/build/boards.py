@@ -21,17 +21,17 @@ NO_BREAK = "\u2011"  # a hyphen at which no line ends
 def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6), **other):
     """One LEADERBOARD row with these Acc, FalseAbs and AbsRec."""
     acc, false_abs, abs_rec = map(np.array, shares)
-    metrics = {name: float(metric.formula(acc, false_abs, abs_rec)) for name, metric in METRIC_WORDS.items()}
+    figures = {name: float(metric.formula(acc, false_abs, abs_rec)) for name, metric in METRIC_WORDS.items()}
     row = {
         **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
-        **metrics,
-        **{f"{name}_std": 0.01 for name in metrics},
+        **figures,
+        **{f"{name}_std": 0.01 for name in figures},
         # Counts of decisions are null, as of every panel that is not asked.
         **{name: None if count.is_of_decisions else 0 for name, count in COUNT_WORDS.items()},
         **{"answered": 1.0, "incomplete": False, "broken": 0.0, "is_broken": False, "panel": "three@1"},
-        **{f"{name}_ci_{end}": value for name, value in metrics.items() for end in ("low", "high")},
+        **{f"{name}_ci_{end}": value for name, value in figures.items() for end in ("low", "high")},
         **{"rank": 1, "rank_low": 1, "rank_high": 2, "naive": float(acc * abs_rec)},
-        **dict.fromkeys(("pecs_low", "pecs_high", "pecs_by_family"), metrics["pecs"]),
+        **dict.fromkeys(("pecs_low", "pecs_high", "pecs_by_family"), figures["pecs"]),
         **{"epoch": "e1", "benchmark_version": "v1"},
     }
     return {**row, **other}

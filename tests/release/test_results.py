@@ -1,4 +1,4 @@
-"""A leaderboard in the forms that others collect is accepted by their own readers, and holds the study's metrics."""
+"""A leaderboard in the forms that others collect is accepted by their own readers, and holds the study's figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def written(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_form_holds_the_metrics_of_the_leaderboard(written: Path, small: Checkout) -> None:
+def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: Checkout) -> None:
     board = Workspace.open(small.workspace).tables.read_all(LEADERBOARD)
     assert pq.read_table(written / "leaderboard.parquet").num_rows == len(board)
     for row in board.loc[board["dataset"] == "overall"].to_dict("records"):
