@@ -339,7 +339,7 @@ def odd_value(value: object) -> object:
 @pytest.mark.parametrize("name", ["items", "responses", "votes", "metrics", "leaderboard"])
 def test_every_column_of_a_table_is_recomputed_or_named_as_not_recomputed(packed: Path, name: str) -> None:
     submission, table = read_submission(packed), TABLES[f"{name}.parquet"]
-    rows, unseen = records(submission.table(table)), list[str]()
+    rows, unseen = records(submission.read_table(table)), list[str]()
     for column in set(table.names) - {"labels", "created_at"}:
         at = next((k for k, row in enumerate(rows) if row[column] is not None), None)
         if at is None:

@@ -96,7 +96,7 @@ def broken(tmp_path_factory):
             for d in (*DATASETS, "overall")
         )
     )
-    overall = {"dataset": "overall", "figure": "pecs", "left_model": SPEAKS, "separable": False}
+    overall = {"dataset": "overall", "metric": "pecs", "left_model": SPEAKS, "separable": False}
     guided, standard = ({"left_regime": r, "right_regime": r, "right_model": THINKS} for r in ("guided", "standard"))
     regimes = {"left_regime": "standard", "right_regime": "guided", "right_model": SPEAKS}
     contrasts = [

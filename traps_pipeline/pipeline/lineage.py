@@ -166,7 +166,7 @@ class Lineage:
         )
         return (
             any(self.status(*node).outdated for node in upstream)
-            or any(lost_parents)  # otherwise figures would be rebuilt from fewer inputs than before
+            or any(lost_parents)  # otherwise tables would be rebuilt from fewer inputs than before
             or bool(self.blocked(name, key, current=True))
         )
 

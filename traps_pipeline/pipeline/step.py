@@ -200,7 +200,7 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
     """Forward a step's events; log progress, and keep keys out of stored tracebacks."""
     report = progress.current()
     try:
-        with report.heard_by(lambda line: context.log.info(page_text(line))):
+        with report.reporting_to(lambda line: context.log.info(page_text(line))):
             yield from events
             report.end_stage()
     except Exception as error:

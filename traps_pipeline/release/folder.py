@@ -93,7 +93,7 @@ class _Folder:
     def text(self, name: str, text: str) -> None:
         write_text(self.root / name, self.hide(text))
 
-    def table(self, table: Table[Any], rows: Sequence[Any]) -> None:
+    def write_table(self, table: Table[Any], rows: Sequence[Any]) -> None:
         lines = [json.dumps({n: getattr(row, n) for n in table.names}, ensure_ascii=False) + "\n" for row in rows]
         self.text(PLACES[table.name], "".join(lines))
         self.rows[table.name] = len(rows)
@@ -112,7 +112,7 @@ def write_release(content: Content, target: Path, options: Options) -> ReleaseSu
         answers = _open_release(folder, content) if options.held_out is None else None
         if options.held_out is not None:
             answers = _held_out_release(folder, content, options.held_out)
-        folder.table(PROMPTS, rows_of.prompt_rows(content.release.canary))
+        folder.write_table(PROMPTS, rows_of.prompt_rows(content.release.canary))
         _pages(folder, content, options)
         files = write_checksums(part, content.release.canary) + 1
         if options.held_out is not None:
@@ -132,13 +132,13 @@ def _require_own(target: Path) -> None:
 
 
 def _open_release(folder: _Folder, content: Content) -> None:
-    folder.table(PAIRS, rows_of.pair_rows(content))
-    folder.table(RELEASED_ITEMS, rows_of.item_rows(content))
-    folder.table(SCENARIOS, rows_of.scenario_rows(content))
+    folder.write_table(PAIRS, rows_of.pair_rows(content))
+    folder.write_table(RELEASED_ITEMS, rows_of.item_rows(content))
+    folder.write_table(SCENARIOS, rows_of.scenario_rows(content))
     if content.two_events:
-        folder.table(TWO_EVENTS_SCENARIOS, rows_of.two_events_rows(content))
-    folder.table(CERTIFICATES, rows_of.certificate_rows(content))
-    folder.table(SPLITS, rows_of.split_rows(content))
+        folder.write_table(TWO_EVENTS_SCENARIOS, rows_of.two_events_rows(content))
+    folder.write_table(CERTIFICATES, rows_of.certificate_rows(content))
+    folder.write_table(SPLITS, rows_of.split_rows(content))
     for name, source in sorted(content.clips.items()):
         write_bytes(folder.root / name, source.read_bytes())
 
@@ -151,7 +151,7 @@ def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path
     items = drawn_items(content.items, key)
     mark_held_out(content.study, items)
     digests = write_held_out_clips(items, content.clips, key, folder.root / CLIPS / "items")
-    folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(items, digests, key, content.release.canary))
+    folder.write_table(HELD_OUT_ITEMS, rows_of.held_out_rows(items, digests, key, content.release.canary))
     names = sorted((opaque_name(key, row["item_id"]), row["item_id"]) for row in items)
     answers = key_file.with_name(f"{key_file.name}.items.jsonl")
     lines = "".join(json.dumps({"item": n, "item_id": id_}) + "\n" for n, id_ in names)

@@ -52,8 +52,8 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
     dataset: the repository of the release, as the hub names it.
 
     `eval_results/MODEL.yaml` goes into the model's repository as `.eval_results/traps.yaml`, with a task for each
-    regime; `data/` has the layout of Every Eval Ever, with each figure and its interval. Raises TrapsError if there is
-    no overall figure.
+    regime; `data/` has the layout of Every Eval Ever, with each metric and its interval. Raises TrapsError if there is
+    no overall metric.
     """
     if not _REPOSITORY.fullmatch(dataset):
         raise TrapsError(f"--dataset {dataset!r:.80}: is no repository of the hub; write it as OWNER/NAME")

@@ -68,7 +68,7 @@ class SubmittedJudge(_Strict):
     premise: bool = False
 
 
-class About(_Strict):
+class SubmissionAbout(_Strict):
     """What a submission says of itself: the contents of `submission.json`.
 
     panel: name of the panel. prompts: version of each regime's. versions: code versions of the tables. files:
@@ -92,11 +92,11 @@ class Submission:
     """A submission in memory. altered: tables whose digest differs from `about`."""
 
     path: Path
-    about: About
+    about: SubmissionAbout
     tables: Mapping[str, pd.DataFrame]
     altered: tuple[str, ...]
 
-    def table(self, table: Table[Any]) -> pd.DataFrame:
+    def read_table(self, table: Table[Any]) -> pd.DataFrame:
         """Return the rows of one of its tables."""
         return self.tables[f"{table.name}.parquet"]
 
@@ -104,7 +104,7 @@ class Submission:
 # --- packing ----------------------------------------------------------------------------------------------------------
 
 
-def pack_submission(workspace: Workspace, target: Path, name: str) -> About:
+def pack_submission(workspace: Workspace, target: Path, name: str) -> SubmissionAbout:
     """Write a study's submission, equal bytes for equal studies. Raises TrapsError unless it is judged and scored."""
     begin_publication(workspace.root, "a submission")
     study = workspace.study
@@ -126,7 +126,7 @@ def pack_submission(workspace: Workspace, target: Path, name: str) -> About:
         for seat in load_panel(study.panel)
     ]
     try:
-        description = About(
+        description = SubmissionAbout(
             name=name,
             benchmark=load_release().name,
             version=load_release().version,
@@ -178,7 +178,7 @@ def read_submission(path: Path) -> Submission:
     except BadArchive as error:
         raise TrapsError(f"{path}: is no submission ({plain(error)[:200]}); get it again") from error
     try:
-        description = About.model_validate_json(content[ABOUT])
+        description = SubmissionAbout.model_validate_json(content[ABOUT])
     except ValidationError as error:
         raise TrapsError(f"{path}: {ABOUT}: {faults_of(error)}; pack it again with `traps publish submit`") from error
     altered_tables = [

@@ -166,7 +166,7 @@ def draw_pair(
         place = (k * (width + GAP) + width / 2, 2 * height + 2 * GAP)
         axes.text(*place, f"{time:.1f} s", ha="center", va="top", size=layout.small, color="#667085")
     axes.set_axis_off()
-    _draw_header(axes, pair, layout)
+    _plot_header(axes, pair, layout)
 
 
 def _hatch(axes: Axes, box: tuple[int, int, int, int], words: str, size: float) -> None:
@@ -180,7 +180,7 @@ def _hatch(axes: Axes, box: tuple[int, int, int, int], words: str, size: float) 
     axes.text(left + width / 2, top + height / 2, words, size=size, **look)
 
 
-def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
+def _plot_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     """Draw scenario and ground truth in bold, and the questions below them."""
     question_of = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
     is_same = question_of["control"] == question_of["void"]

@@ -83,7 +83,7 @@ LEGEND = {
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **TWO_WAY_MEANINGS,
-    "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
+    "Epoch": "the evaluation campaign; metrics of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
 
@@ -219,7 +219,7 @@ def _leaderboard(
     if two_way is not None and len(shown := rows[["model", "regime"]].merge(two_way.loc[two_way["n_scenarios"] > 0])):
         rows = rows.merge(shown[["model", "regime", *(column.field for column in TWO_WAY_COLUMNS)]], "left")
         columns += TWO_WAY_COLUMNS
-        refusals = [f"no figure of two events: {reason}" for reason in shown["refused"].dropna().unique()]
+        refusals = [f"no metric of two events: {reason}" for reason in shown["refused"].dropna().unique()]
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
     columns += [column for column, field in OPTIONAL.items() if (rows.loc[:, field] > 0).any()]
     columns += [

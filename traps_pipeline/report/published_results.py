@@ -84,12 +84,12 @@ def _probes(results: Results) -> pd.DataFrame:
 def _cosines(results: Results) -> pd.DataFrame:
     """Return COSINES rows: qwen3-vl-8b's matrix, and other models' values in the text."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
-    other_figures = published("other")
-    other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
-    pairs = other_figures["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
-    other_figures = other_figures.assign(source=pairs[0], other=pairs[1], cosine=other_figures["value"].astype(float))
-    mirrored_rows = other_figures.rename(columns={"source": "other", "other": "source"})
-    all_cosines = pd.concat([matrix, other_figures, mirrored_rows], ignore_index=True)
+    other_numbers = published("other")
+    other_numbers = other_numbers.loc[other_numbers["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
+    pairs = other_numbers["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
+    other_numbers = other_numbers.assign(source=pairs[0], other=pairs[1], cosine=other_numbers["value"].astype(float))
+    mirrored_rows = other_numbers.rename(columns={"source": "other", "other": "source"})
+    all_cosines = pd.concat([matrix, other_numbers, mirrored_rows], ignore_index=True)
     all_cosines = _long(all_cosines).rename(columns={"source": "dataset", "other": "other_dataset"})
     return _as(
         COSINES, [all_cosines.assign(layer=_steered_layers(all_cosines), prompt="standard", other_prompt="standard")]

@@ -1,6 +1,6 @@
 """Prepare the frames behind tables and figures, for a study or the paper.
 
-A frame without rows means that its part was not run. Shares are fractions; every frame with figures has a column
+A frame without rows means that its part was not run. Shares are fractions; every frame with metrics has a column
 `epoch`.
 """
 
@@ -140,7 +140,7 @@ class Results:
 
     def __init__(self) -> None:
         self.kept: dict[str, list[PrintedTable]] = {}  # the tables of the catalogue that were made of them, by name
-        # The reasons, by analysis, why figures were not computed: their sides are of different epochs.
+        # The reasons, by analysis, why metrics were not computed: their sides are of different epochs.
         self.refused: dict[str, list[str]] = {}
 
     def rows(self, table: Table) -> pd.DataFrame:

@@ -66,7 +66,7 @@ Trace = Callable[[Mapping[str, Any], str], SourceItems | None]  # row and field 
 
 
 def fraction(value: float | None, digits: int = 3) -> str:
-    """Return a figure as printed, with a typographic minus sign; a dash for null."""
+    """Return a number as printed, with a typographic minus sign; a dash for null."""
     import pandas as pd
 
     if value is None or pd.isna(value):
@@ -124,13 +124,13 @@ class Column:
             return value or "", "", ""
         if self.unit in ("text", "range"):
             return "" if value is None or value is pd.NA or value != value else plain(value), "", ""
-        figure = self._number(value)
+        printed = self._number(value)
         low, high = (self._number(row.get(f"{self.field}_ci_{end}")) for end in ("low", "high"))
-        if self.interval and NONE not in (figure, low):
-            figure += f" [{low}, {high}]"
-        spread = self._number(row.get(self.spread)) if self.spread and figure != NONE else NONE
+        if self.interval and NONE not in (printed, low):
+            printed += f" [{low}, {high}]"
+        spread = self._number(row.get(self.spread)) if self.spread and printed != NONE else NONE
         mark = row.get(self.mark) if self.mark else ""
-        return figure, "" if spread == NONE else spread, plain(mark) if isinstance(mark, str) and mark else ""
+        return printed, "" if spread == NONE else spread, plain(mark) if isinstance(mark, str) and mark else ""
 
     def _number(self, value: Any) -> str:
         digits = DIGITS[self.unit] if self.digits is None else self.digits
@@ -140,8 +140,8 @@ class Column:
 
 
 def _joined(parts: tuple[str, str, str]) -> str:
-    figure, spread, mark = parts
-    return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
+    printed, spread, mark = parts
+    return printed + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
 
 @dataclass(frozen=True)
@@ -287,9 +287,9 @@ def table_latex(table: PrintedTable) -> str:
 def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None = None) -> str:
     """Return a table in a scrolling box with notes; `address`: link to the items."""
 
-    def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
-        is_figure = column.is_number and figure not in ("", NONE)
-        trace = table.trace(row, column.field) if is_figure and table.trace and address else None
+    def link(row: Mapping[str, Any], column: Column, printed: str) -> str | None:
+        is_known = column.is_number and printed not in ("", NONE)
+        trace = table.trace(row, column.field) if is_known and table.trace and address else None
         return address(trace) if trace and address else None
 
     columns = [

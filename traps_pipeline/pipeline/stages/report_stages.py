@@ -56,11 +56,11 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
     ]
     contents, rebuilt_names = make_pieces(workspace, "report_page", code_of(GROUP), pieces)
     files = report_files(sources.study, [(name.partition("/")[0], Card.read(data)) for name, data in contents.items()])
-    figures = {
+    shown = {
         "made again": f"{len(rebuilt_names)} of {len(pieces)}: {', '.join(rebuilt_names[:NAMES]) or 'none'}",
         "leaderboard": Markdown(files[MARKDOWN].decode()),
     }
-    return StageOutput(files | {BOARD_FILE: board_bytes(board_tables(workspace))}, shown=figures)
+    return StageOutput(files | {BOARD_FILE: board_bytes(board_tables(workspace))}, shown=shown)
 
 
 @_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))
