@@ -73,7 +73,7 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
 
 
 def arms_of_pairs(workspace: Workspace, category: str) -> list[str]:
-    """Return those of them that scenarios of pairs have."""
+    """Return which of these arms are filmed from scenarios of pairs."""
     return [arm for arm in asked_arms(workspace, category) if arm != TWO_EVENTS]
 
 

@@ -280,7 +280,7 @@ def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: li
 def check_live(
     entries: Iterable[Entry], forms: Mapping[str, Collection[str] | None] = MappingProxyType({})
 ) -> list[LiveResult]:
-    """Ask these entries in parallel, without a study; their cost is not recorded, but how long an answer takes.
+    """Try models and judges with short calls in parallel, without a study; seconds are recorded, costs are not.
 
     forms: by an entry's id, see `requests_of`.
     """

@@ -254,7 +254,7 @@ class AnswerSlice(Cell):
 
     @property
     def whole(self) -> Cell:
-        """The cell of this slice."""
+        """The cell of answers that this slice is a part of."""
         return Cell(self.dataset, self.evaluation)
 
 

@@ -170,7 +170,7 @@ class ProbeRun:
         return [self._score_row("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the same pairs restricted to confabulated voids and their controls."""
+        """Return the transfer's pairs whose void the model confabulated on, with their controls."""
         confabulated_splits = self._confabulated_splits(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(confabulated_splits)]
         scores = transfer_scores(confabulated_splits, pairs, self.fit)

@@ -58,14 +58,14 @@ def _require_clips(find: Callable[[], Found]) -> Found:
 
 
 class PairPictures:
-    """The pictures of a study."""
+    """Still pictures of a study's pairs, for report and explorer."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
 
     @cached_property
     def items(self) -> pd.DataFrame:
-        """ITEMS rows of the pairs."""
+        """Rows of table `items` that belong to pairs."""
         return self.workspace.tables.read_all(ITEMS, dataset=DATASETS)
 
     @cached_property

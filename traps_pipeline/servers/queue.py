@@ -41,7 +41,7 @@ def queue(
     flagged: pd.DataFrame,
     alike: Mapping[str, float],
 ) -> list[str]:
-    """Return a queue's scenarios in order; reviewed ones stay only in `all`.
+    """Return the scenarios that a review queue offers, in order; reviewed ones stay only in `all`.
 
     flagged: `flags`; alike: by scenario, the distance of its most similar one.
     """

@@ -35,7 +35,7 @@ Record = Mapping[str, Any]
 
 
 class Decision(BaseModel):
-    """A reviewer's decision.
+    """A reviewer's decision about a scenario, as the page sends it.
 
     seen: the number of decisions about the scenario on the page. `add` creates a new scenario of the same family, with
     this one's parameters and the changes.
