@@ -26,7 +26,9 @@ def add(commands: Commands) -> None:
 
     text = "write every table, figure and page to one file, or to a folder"
     parser = commands.add("results export", export_results, text, example="results.zip")
-    parser.add_argument("folder", nargs="?", type=Path, help="or a file .zip; default: `export.zip` in the study's folder")
+    parser.add_argument(
+        "folder", nargs="?", type=Path, help="or a file .zip (default: `export.zip` in the study's folder)"
+    )
 
     text = "print this study minus another on their common pairs, with paired intervals"
     parser = commands.add("results compare", compare_studies, text, example=".workspaces/earlier", json=True)
