@@ -132,10 +132,13 @@ def _by_evaluation(cells: Sequence[AnyCell]) -> list[tuple[Evaluation, list[AnyC
     return [(evaluation, list(group)) for evaluation, group in groupby(ordered, key=lambda cell: cell.evaluation)]
 
 
-class _CellTask(Generic[AnyCell, AnyCall]):
-    """A cell that is being settled. before: the cell that was begun before it.
+_AHEAD = 64  # calls of cells that are begun, beyond which another waits for the first: their rows are held
 
-    keys: those of its calls. all_sent: set once no call of it waits to be sent.
+
+class _CellTask(Generic[AnyCell, AnyCall]):
+    """A cell that is being settled. before: cells of its evaluation that were begun before it.
+
+    keys: those of its calls. n_missing: how many the ledger lacks. all_sent: set once no call of it waits to be sent.
     """
 
     def __init__(
@@ -143,22 +146,23 @@ class _CellTask(Generic[AnyCell, AnyCall]):
         work: Work[AnyCell, AnyCall, Any],
         cell: AnyCell,
         its: EvaluationState,
-        before: "_CellTask[AnyCell, AnyCall] | None",
+        before: "Sequence[_CellTask[AnyCell, AnyCall]]",
         stop: asyncio.Event,
     ) -> None:
         self._work, self._cell, self._its, self._stop = work, cell, its, stop
-        self.keys, self.all_sent = set[str](), asyncio.Event()
+        self.keys, self.n_missing, self.all_sent = set[str](), 0, asyncio.Event()
         self.task = asyncio.create_task(self._settle(before))
         self.task.add_done_callback(lambda _: self.all_sent.set())
 
-    async def _settle(self, before: "_CellTask[AnyCell, AnyCall] | None") -> SettledCell[AnyCell, AnyCall] | None:
+    async def _settle(self, before: "Sequence[_CellTask[AnyCell, AnyCall]]") -> SettledCell[AnyCell, AnyCall] | None:
         """Ask for the missing calls; return None if that was stopped."""
         try:
             calls = self._work.calls(self._cell)
             requests = {call.request.key: call.request for call in calls}
             self.keys.update(requests)
-            if before is not None and before.keys & self.keys:
-                await asyncio.wait([before.task])  # a call that two cells share (a steered control) is paid once
+            for other in before:
+                if other.keys & self.keys:  # a call that two cells share (a steered control) is paid once
+                    await asyncio.wait([other.task])
             rows, asker = await self._ask_missing(requests)
             if self._stop.is_set() or len(rows) < len(requests):
                 return None
@@ -186,6 +190,7 @@ class _CellTask(Generic[AnyCell, AnyCall]):
         if not work.is_counted:
             counts = Counter((request.participant, key in rows) for key, request in requests.items())
             report.asking(work.stage, _by_name(counts), self._cell.share)
+        self.n_missing = len(missing)
         asker = Asking(work, its, missing, self._stop, self.all_sent)
         await asker.run()
         return rows | asker.rows, asker
@@ -196,25 +201,24 @@ async def settle_evaluation(
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall]]:
     """Settle one evaluation's cells by asking missing calls; yield the finished ones in order.
 
-    While the last calls of a cell are in flight, those of the next are sent, so that no connection is idle: calls and
-    rows of two cells are held.
+    While the last calls of a cell are in flight, those of the next are sent, so that no connection is idle.
     """
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
         its, begun = EvaluationState(writer), deque[_CellTask[AnyCell, AnyCall]]()
+        upcoming = deque(cells)
         try:
-            for cell in cells:
-                begun.append(_CellTask(work, cell, its, begun[-1] if begun else None, stop))
-                if len(begun) > 1:
-                    settled_cell = await begun[0].task
-                    if settled_cell is None:
-                        await begun[1].task  # raises why, unless all was stopped
-                        return  # finished answers are in the ledger
-                    begun.popleft()
-                    yield settled_cell
-                    del settled_cell
-                await begun[-1].all_sent.wait()
-            if begun and (settled_cell := await begun[-1].task) is not None:
+            while upcoming or begun:
+                is_full = bool(begun) and (not begun[0].n_missing or sum(each.n_missing for each in begun) >= _AHEAD)
+                if upcoming and not is_full:
+                    begun.append(_CellTask(work, upcoming.popleft(), its, [*begun], stop))
+                    await begun[-1].all_sent.wait()
+                    continue
+                if (settled_cell := await begun[0].task) is None:
+                    await asyncio.gather(*(each.task for each in begun))  # raises why, unless all was stopped
+                    return  # finished answers are in the ledger
+                begun.popleft()
                 yield settled_cell
+                del settled_cell
         finally:
             its.is_over = True
             await _drain([cell_task.task for cell_task in begun])

@@ -46,6 +46,7 @@ class Asking:
                 pass
         except Exception as error:  # noqa: BLE001 - raised by `run`, once the calls in flight are in the ledger
             self.problems.append(error)
+            self.its.is_over = True
 
     async def _one(self, participant: Participant, queue: deque[Request]) -> bool:
         """Ask and record one request of the queue; return False if none is left."""
@@ -75,7 +76,7 @@ class Asking:
 
     def _halted(self) -> bool:
         """Return whether to stop sending calls."""
-        return self.stop.is_set() or bool(self.problems) or self.its.is_over
+        return self.stop.is_set() or self.its.is_over
 
     async def _sync(self) -> None:
         while True:
@@ -84,6 +85,7 @@ class Asking:
                 await self.its.writer.sync()
             except TrapsError as error:  # a disk that cannot be synced stops new calls
                 self.problems.append(error)
+                self.its.is_over = True
                 return
 
     async def run(self) -> None:
