@@ -141,15 +141,8 @@ class _CellTask(Generic[AnyCell, AnyCall]):
     keys: those of its calls. n_missing: how many the ledger lacks. all_sent: set once no call of it waits to be sent.
     """
 
-    def __init__(
-        self,
-        work: Work[AnyCell, AnyCall, Any],
-        cell: AnyCell,
-        its: EvaluationState,
-        before: "Sequence[_CellTask[AnyCell, AnyCall]]",
-        stop: asyncio.Event,
-    ) -> None:
-        self._work, self._cell, self._its, self._stop = work, cell, its, stop
+    def __init__(self, cell: AnyCell, its: EvaluationState, before: "Sequence[_CellTask[AnyCell, AnyCall]]") -> None:
+        self._cell, self._its = cell, its
         self.keys, self.n_missing, self.all_sent = set[str](), 0, asyncio.Event()
         self.task = asyncio.create_task(self._settle(before))
         self.task.add_done_callback(lambda _: self.all_sent.set())
@@ -157,18 +150,18 @@ class _CellTask(Generic[AnyCell, AnyCall]):
     async def _settle(self, before: "Sequence[_CellTask[AnyCell, AnyCall]]") -> SettledCell[AnyCell, AnyCall] | None:
         """Ask for the missing calls; return None if that was stopped."""
         try:
-            calls = self._work.calls(self._cell)
+            calls = self._its.work.calls(self._cell)
             requests = {call.request.key: call.request for call in calls}
             self.keys.update(requests)
             for other in before:
                 if other.keys & self.keys:  # a call that two cells share (a steered control) is paid once
                     await asyncio.wait([other.task])
             rows, asker = await self._ask_missing(requests)
-            if self._stop.is_set() or len(rows) < len(requests):
+            if self._its.stop.is_set() or len(rows) < len(requests):
                 return None
             for refused in refused_calls(requests.values(), rows):
                 rows |= await _settle_refusals(asker, refused, rows)
-            if self._stop.is_set():
+            if self._its.stop.is_set():
                 return None
             await self._its.writer.sync()
         except BaseException:
@@ -180,7 +173,7 @@ class _CellTask(Generic[AnyCell, AnyCall]):
 
     async def _ask_missing(self, requests: Mapping[str, Request]) -> tuple[dict[str, Row], Asking]:
         """Ask for the requests that the ledger lacks; return the rows of all that were answered, and the asker."""
-        work, its, report = self._work, self._its, progress.current()
+        work, its, report = self._its.work, self._its, progress.current()
         recorded_rows = await asyncio.to_thread(work.ledger.read, self._cell.evaluation.key, requests)
         for location in sorted({*recorded_rows.notes} - its.reported):
             report.note(f"{location}: {recorded_rows.notes[location]}")
@@ -191,7 +184,7 @@ class _CellTask(Generic[AnyCell, AnyCall]):
             counts = Counter((request.participant, key in rows) for key, request in requests.items())
             report.asking(work.stage, _by_name(counts), self._cell.share)
         self.n_missing = len(missing)
-        asker = Asking(work, its, missing, self._stop, self.all_sent)
+        asker = Asking(its, missing, self.all_sent)
         await asker.run()
         return rows | asker.rows, asker
 
@@ -204,13 +197,13 @@ async def settle_evaluation(
     While the last calls of a cell are in flight, those of the next are sent, so that no connection is idle.
     """
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
-        its, begun = EvaluationState(writer), deque[_CellTask[AnyCell, AnyCall]]()
+        its, begun = EvaluationState(work, writer, stop), deque[_CellTask[AnyCell, AnyCall]]()
         upcoming = deque(cells)
         try:
             while upcoming or begun:
                 is_full = bool(begun) and (not begun[0].n_missing or sum(each.n_missing for each in begun) >= _AHEAD)
                 if upcoming and not is_full:
-                    begun.append(_CellTask(work, upcoming.popleft(), its, [*begun], stop))
+                    begun.append(_CellTask(upcoming.popleft(), its, [*begun]))
                     await begun[-1].all_sent.wait()
                     continue
                 if (settled_cell := await begun[0].task) is None:
@@ -221,15 +214,7 @@ async def settle_evaluation(
                 del settled_cell
         finally:
             its.is_over = True
-            await _drain([cell_task.task for cell_task in begun])
-
-
-async def _drain(tasks: Sequence[asyncio.Task[Any]]) -> None:
-    """Wait until the calls in flight are in the ledger; cancel them where this task is canceled."""
-    if (current := asyncio.current_task()) and current.cancelling():
-        for task in tasks:
-            task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+            await asyncio.gather(*(each.task for each in begun), return_exceptions=True)  # records calls in flight
 
 
 async def _settle_refusals(asker: Asking, calls: RefusedCalls, rows: Mapping[str, Row]) -> dict[str, Row]:

@@ -19,21 +19,25 @@ if TYPE_CHECKING:
 
 @dataclass
 class EvaluationState:
-    """State that the cells of an evaluation share: writer, ledger places reported, whether no call is sent any more."""
+    """What the cells of an evaluation share. reported: places of the ledger. is_over: no call is sent any more."""
 
+    work: "Work[Any, Any, Any]"
     writer: Writer
+    stop: asyncio.Event
     reported: set[str] = field(default_factory=set)
     is_over: bool = False
+
+    def is_halted(self) -> bool:
+        """Return whether to stop sending calls."""
+        return self.stop.is_set() or self.is_over
 
 
 @dataclass
 class Asking:
     """Workers over a cell's missing requests. again: what to record of a call that is repeated to settle it."""
 
-    work: "Work[Any, Any, Any]"
     its: EvaluationState
     missing: Sequence[Request]
-    stop: asyncio.Event
     all_sent: asyncio.Event
     again: Callable[[Outcome], Outcome] | None = None
     rows: dict[str, Row] = field(default_factory=dict)
@@ -50,13 +54,13 @@ class Asking:
 
     async def _one(self, participant: Participant, queue: deque[Request]) -> bool:
         """Ask and record one request of the queue; return False if none is left."""
-        if not queue or self._halted():
+        if not queue or self.its.is_halted():
             return False
         request, name = queue.popleft(), participant.entry.id
         self.n_sent += 1
         if self.n_sent == len(self.missing):
             self.all_sent.set()
-        context = CallContext(self.work.budget, self.stop, self._halted, self.its.writer.require)
+        context = CallContext(self.its.work.budget, self.its.stop, self.its.is_halted, self.its.writer.require)
         attempt_result = await ask_once(participant, request, context)
         if attempt_result is None:
             return False
@@ -69,14 +73,10 @@ class Asking:
 
     async def write(self, request: Request, outcome: Outcome, attempts: int, seconds: float, paid_by: list[str]) -> Row:
         """Record an outcome in the ledger and return its row."""
-        row, side_texts = ledger_row(request, outcome, attempts, seconds, self.work.epoch)
+        row, side_texts = ledger_row(request, outcome, attempts, seconds, self.its.work.epoch)
         await self.its.writer.write(row, side_texts, paid_by)
         self.rows[request.key] = HeldRow(row)
         return row
-
-    def _halted(self) -> bool:
-        """Return whether to stop sending calls."""
-        return self.stop.is_set() or self.its.is_over
 
     async def _sync(self) -> None:
         while True:
@@ -93,7 +93,7 @@ class Asking:
         queues: dict[str, deque[Request]] = {}
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
-        queue_of = [(self.work.participants[name], queue) for name, queue in queues.items()]
+        queue_of = [(self.its.work.participants[name], queue) for name, queue in queues.items()]
         sync_task = asyncio.create_task(self._sync())
         try:
             async with asyncio.TaskGroup() as group:
