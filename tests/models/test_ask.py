@@ -147,7 +147,7 @@ def test_a_cell_is_asked_while_the_last_call_of_the_one_before_is_in_flight(tmp_
     waits = {"item-0": "item-2", "item-2": "item-4"}  # answered once a call of the next cell has come
 
     async def ask(asked: Request) -> Outcome:
-        item = asked.about["item_id"]
+        item = str(asked.about["item_id"])
         backend.calls.append(item)
         async with asyncio.timeout(5):
             while waits.get(item, item) not in backend.calls:

@@ -141,8 +141,14 @@ class _CellTask(Generic[AnyCell, AnyCall]):
     keys: those of its calls. n_missing: how many the ledger lacks. all_sent: set once no call of it waits to be sent.
     """
 
-    def __init__(self, cell: AnyCell, its: EvaluationState, before: "Sequence[_CellTask[AnyCell, AnyCall]]") -> None:
-        self._cell, self._its = cell, its
+    def __init__(
+        self,
+        work: Work[AnyCell, AnyCall, Any],
+        cell: AnyCell,
+        its: EvaluationState,
+        before: "Sequence[_CellTask[AnyCell, AnyCall]]",
+    ) -> None:
+        self._work, self._cell, self._its = work, cell, its
         self.keys, self.n_missing, self.all_sent = set[str](), 0, asyncio.Event()
         self.task = asyncio.create_task(self._settle(before))
         self.task.add_done_callback(lambda _: self.all_sent.set())
@@ -150,7 +156,7 @@ class _CellTask(Generic[AnyCell, AnyCall]):
     async def _settle(self, before: "Sequence[_CellTask[AnyCell, AnyCall]]") -> SettledCell[AnyCell, AnyCall] | None:
         """Ask for the missing calls; return None if that was stopped."""
         try:
-            calls = self._its.work.calls(self._cell)
+            calls = self._work.calls(self._cell)
             requests = {call.request.key: call.request for call in calls}
             self.keys.update(requests)
             for other in before:
@@ -173,7 +179,7 @@ class _CellTask(Generic[AnyCell, AnyCall]):
 
     async def _ask_missing(self, requests: Mapping[str, Request]) -> tuple[dict[str, Row], Asking]:
         """Ask for the requests that the ledger lacks; return the rows of all that were answered, and the asker."""
-        work, its, report = self._its.work, self._its, progress.current()
+        work, its, report = self._work, self._its, progress.current()
         recorded_rows = await asyncio.to_thread(work.ledger.read, self._cell.evaluation.key, requests)
         for location in sorted({*recorded_rows.notes} - its.reported):
             report.note(f"{location}: {recorded_rows.notes[location]}")
@@ -197,13 +203,13 @@ async def settle_evaluation(
     While the last calls of a cell are in flight, those of the next are sent, so that no connection is idle.
     """
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
-        its, begun = EvaluationState(work, writer, stop), deque[_CellTask[AnyCell, AnyCall]]()
-        upcoming = deque(cells)
+        its = EvaluationState(work.participants, work.budget, work.epoch, writer, stop)
+        upcoming, begun = deque(cells), deque[_CellTask[AnyCell, AnyCall]]()
         try:
             while upcoming or begun:
                 is_full = bool(begun) and (not begun[0].n_missing or sum(each.n_missing for each in begun) >= _AHEAD)
                 if upcoming and not is_full:
-                    begun.append(_CellTask(upcoming.popleft(), its, [*begun]))
+                    begun.append(_CellTask(work, upcoming.popleft(), its, [*begun]))
                     await begun[-1].all_sent.wait()
                     continue
                 if (settled_cell := await begun[0].task) is None:

@@ -4,24 +4,24 @@ import asyncio
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.ledger.ledger import SYNC_S, Writer
 from traps_pipeline.ledger.rows import is_settled
-from traps_pipeline.models.asking.participants import CallContext, Participant, Row, ask_once, ledger_row
+from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, ask_once, ledger_row
+from traps_pipeline.models.money.budget import Budget
 from traps_pipeline.models.request import Outcome, Request
-
-if TYPE_CHECKING:
-    from traps_pipeline.models.asking.ask import Work
 
 
 @dataclass
 class EvaluationState:
     """What the cells of an evaluation share. reported: places of the ledger. is_over: no call is sent any more."""
 
-    work: "Work[Any, Any, Any]"
+    participants: Participants
+    budget: Budget
+    epoch: str
     writer: Writer
     stop: asyncio.Event
     reported: set[str] = field(default_factory=set)
@@ -60,7 +60,7 @@ class Asking:
         self.n_sent += 1
         if self.n_sent == len(self.missing):
             self.all_sent.set()
-        context = CallContext(self.its.work.budget, self.its.stop, self.its.is_halted, self.its.writer.require)
+        context = CallContext(self.its.budget, self.its.stop, self.its.is_halted, self.its.writer.require)
         attempt_result = await ask_once(participant, request, context)
         if attempt_result is None:
             return False
@@ -73,7 +73,7 @@ class Asking:
 
     async def write(self, request: Request, outcome: Outcome, attempts: int, seconds: float, paid_by: list[str]) -> Row:
         """Record an outcome in the ledger and return its row."""
-        row, side_texts = ledger_row(request, outcome, attempts, seconds, self.its.work.epoch)
+        row, side_texts = ledger_row(request, outcome, attempts, seconds, self.its.epoch)
         await self.its.writer.write(row, side_texts, paid_by)
         self.rows[request.key] = HeldRow(row)
         return row
@@ -93,7 +93,7 @@ class Asking:
         queues: dict[str, deque[Request]] = {}
         for request in self.missing:
             queues.setdefault(request.participant, deque()).append(request)
-        queue_of = [(self.its.work.participants[name], queue) for name, queue in queues.items()]
+        queue_of = [(self.its.participants[name], queue) for name, queue in queues.items()]
         sync_task = asyncio.create_task(self._sync())
         try:
             async with asyncio.TaskGroup() as group:
