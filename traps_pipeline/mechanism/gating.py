@@ -88,7 +88,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return all items as `gate.GateItems.table`, in the order of `states.items`."""
+    """Return the table of items that the abstention gate reads, in the order of their hidden states."""
     items = states.items
     id_columns = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     table = id_columns.assign(family=families(items), prompt=items["states_key"])

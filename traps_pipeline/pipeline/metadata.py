@@ -76,7 +76,7 @@ def tally_metadata(stage: Stage, tally: Tally) -> dict[str, int]:
 
 
 def tally_of(metadata: Mapping[str, dg.MetadataValue]) -> Tally:
-    """Return the work that `tally_metadata` has written."""
+    """Read a partition's counts of calls back from Dagster's metadata."""
     return Tally(**{name: cast(int, metadata[word].value) for name, word in WORDS.items() if word in metadata})
 
 

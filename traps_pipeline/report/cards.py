@@ -56,12 +56,12 @@ class Card:
 
     @classmethod
     def read(cls, data: bytes) -> Card:
-        """Return the card that `data` serialized."""
+        """Read a report card from its JSON."""
         return cls(**json.loads(data))
 
     @property
     def data(self) -> bytes:
-        """The card as JSON, from which `read` makes it again."""
+        """The report card as JSON."""
         return json.dumps(asdict(self)).encode()
 
 
@@ -121,7 +121,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: LinkOf | None) -> list[Mapping[str, object]]:
-    """Return each table's title (empty if the card's), fragment and downloads by name."""
+    """Return the HTML of a card's tables, each with its title and downloads by name."""
     return [
         {
             "title": table.title if table.title != title else "",

@@ -88,7 +88,7 @@ class Review:
 
     @cached_property
     def flags(self) -> Any:
-        """`queue.flags` of the study at the start of the review."""
+        """Judges' and models' disagreement by scenario, as of the review's start."""
         return flags(self.workspace)
 
     @cached_property
@@ -120,7 +120,7 @@ class Review:
         return frozenset(id_ for id_, correction in last.items() if is_reviewed([correction]))
 
     def queue(self, name: QueueName) -> list[str]:
-        """Return the scenarios of a queue (`queue.queue`)."""
+        """Return the scenarios that a queue of the review pages offers, in order."""
         distances = {id_: neighbour.distance for id_, neighbour in self.comparison.found.items()}
         return queue(name, list(self.specs), self.reviewed(), self.flags, distances)
 

@@ -65,7 +65,7 @@ class SettledCell(Generic[AnyCell, AnyCall]):
 
 @dataclass(frozen=True)
 class Work(Generic[AnyCell, AnyCall, Finished]):
-    """A stage's calls by cell, and `finish`, which makes its table."""
+    """A stage's work: who is asked, under which budget, each cell's calls, and how its table is made."""
 
     stage: str
     ledger: Ledger

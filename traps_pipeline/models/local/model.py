@@ -177,7 +177,7 @@ class LocalModel:
         return text
 
     def caching_clips(self) -> AbstractContextManager[None]:
-        """Cache the vision tower's output per clip within the block (`clips`)."""
+        """Cache the vision tower's output per clip within the block."""
         return self.clips.remembering(self.network)
 
     # --- hidden states ------------------------------------------------------------------------------------------------
