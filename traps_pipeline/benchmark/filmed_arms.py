@@ -83,7 +83,7 @@ def asked_lanes(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render missing arms of a category; return which were made here. Raises TrapsError."""
+    """Render missing arms; return the number of frames drawn, and whether all exist. Raises TrapsError."""
     specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
 
     def files(row: Row) -> list[Path]:

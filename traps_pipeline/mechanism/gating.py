@@ -96,7 +96,7 @@ def gate_table(states: StoredStates) -> pd.DataFrame:
 
 
 def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
-    """Return the layer of each target's gates, by `layer_choice` without its labels."""
+    """Return the layer at which each target's gate reads hidden states, chosen without its labels."""
     rows = workspace.tables.read(PROBES, states.extraction.partition).to_dict("records")
     curves = pair_curves({str(name): value for name, value in row.items()} for row in rows)
     return {target: layer_choice(curves, target).layer for target in targets}

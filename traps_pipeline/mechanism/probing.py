@@ -358,7 +358,7 @@ def _row(
 
 
 def mark_layers(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with flags on the layers that tables show.
+    """Mark, in rows of probes, the layers that the report's tables show.
 
     own_best: the maximum of the row's own curve (the paper's choice, which uses target labels); all_sample_best: the
     maximum of the pair's all-sample transfer curve; chosen: the layer of the target without its labels

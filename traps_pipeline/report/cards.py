@@ -89,7 +89,7 @@ def explorer_address(behind: SourceItems) -> str:
 
 
 def table_card(report: TableReport, sources: Sources, address: LinkOf | None = explorer_address) -> Card:
-    """Return the card of a study's tables."""
+    """Return a report card that holds one or more tables of a study."""
     name = _name(report)
     try:
         tables = report.tables(sources.study)

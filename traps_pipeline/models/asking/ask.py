@@ -198,7 +198,7 @@ class _CellTask(Generic[AnyCell, AnyCall]):
 async def settle_evaluation(
     work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall]]:
-    """Settle one evaluation's cells by asking missing calls; yield the finished ones in order.
+    """Ask for the missing calls of one evaluation's cells; yield the finished cells in order.
 
     While the last calls of a cell are in flight, those of the next are sent, so that no connection is idle.
     """
@@ -239,7 +239,7 @@ async def _settle_refusals(asker: Asking, calls: RefusedCalls, rows: Mapping[str
 async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
-    """Settle all cells, models in parallel; a failing model yields its exception."""
+    """Ask for the missing calls of all cells, models in parallel; a failing model yields its exception."""
     results: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     write_turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
@@ -280,7 +280,7 @@ async def settle(
 
 
 def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -> Iterator[Finished]:
-    """Settle cells and finish each (write its table) just before it is yielded.
+    """Ask for the missing calls of all cells; yield each cell once its table is written.
 
     The first Ctrl-C, SIGTERM or SIGHUP stops new calls and waits for those in flight, a second one stops at once;
     either way KeyboardInterrupt is raised and the same command continues later. A caller that closes the iterator early
