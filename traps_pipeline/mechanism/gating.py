@@ -22,7 +22,7 @@ from traps_pipeline.mechanism.gate import (
     Outcomes,
     families,
     gate_answers,
-    separation,
+    gate_auroc,
     sources_of_gate,
 )
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
@@ -209,7 +209,7 @@ def _rows(
                 about_pecs = interval(metrics_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
                 dataset_figures.append(values)
                 draws.append(metrics_of(sums, in_mean=True)[:, _PECS, 1:])
-            area = separation(decisions, outcome.void)
+            area = gate_auroc(decisions, outcome.void)
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))
         if len(dataset_figures) == len(DATASETS):
