@@ -73,7 +73,7 @@ def asked_arms(workspace: Workspace, category: str) -> list[str]:
 
 
 def arms_of_pairs(workspace: Workspace, category: str) -> list[str]:
-    """Return those of them that scenarios of pairs have."""
+    """Return which of these arms are filmed from scenarios of pairs."""
     return [arm for arm in asked_arms(workspace, category) if arm != TWO_EVENTS]
 
 
@@ -83,7 +83,7 @@ def asked_lanes(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render missing arms of a category; return `make_together`'s result. Raises TrapsError."""
+    """Render missing arms; return the number of frames drawn, and whether all exist. Raises TrapsError."""
     specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
 
     def files(row: Row) -> list[Path]:

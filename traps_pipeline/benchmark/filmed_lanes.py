@@ -66,7 +66,7 @@ def trajectories_of(spec: TwoEventsSpec, path: Path | None = None) -> dict[str, 
 def film_lanes(
     workspace: Workspace, category: str, specs: Mapping[str, TwoEventsSpec], *, wait: bool
 ) -> tuple[int, bool]:
-    """Render missing clips of a category's records; return `make_together`'s result. Raises TrapsError."""
+    """Render missing clips; return the number of frames drawn, and whether all exist. Raises TrapsError."""
     rows: list[Row] = [{"scenario_id": id_} for id_ in specs]
 
     def files(row: Row) -> list[Path]:

@@ -42,7 +42,7 @@ class Footage:
 
 
 def read_footage(path: Path, start_s: float = 0.0, end_s: float | None = None) -> Footage:
-    """Return what a video shows from `start_s` to `end_s` (default: to its end). Raises UnusableFootage."""
+    """Read a video's frames from `start_s` to `end_s` (default: to its end). Raises UnusableFootage."""
     import av
     from av.error import FFmpegError
 

@@ -27,7 +27,7 @@ _TINY, _ALIKE_LEVELS = (16, 12), 8  # size of a near duplicate's pictures, by ho
 
 
 def measure_leaks(records: Sequence[SceneSpec], out: Path) -> str:
-    """Write FILE below `out`: a row a cue and dataset; return tables and remarks as lines of text."""
+    """Measure how well single cues of recorded clips tell control from void; write JSON, return text."""
     from scipy.stats import binomtest
 
     looks = {

@@ -34,7 +34,7 @@ class RecordedClips:
 
 
 def make_clips(pair: RecordedPair, folder: Path) -> RecordedClips:
-    """Return what a pair shows. Raises UnusableFootage naming the clip that makes none."""
+    """Cut a recorded pair's two clips from its videos. Raises UnusableFootage naming the clip that cannot be made."""
     files = {side: name for side in ("control", "void", "twin") if (name := getattr(pair, side)) is not None}
     footage, originals, notes = dict[str, Footage](), dict[str, str](), list[str]()
     for side, name in files.items():

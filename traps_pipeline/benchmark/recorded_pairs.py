@@ -110,7 +110,7 @@ class RecordedPair(BaseModel):
 
 
 def read_pairs(folder: Path) -> tuple[list[RecordedPair], list[str]]:
-    """Return the table's pairs, and its wrong lines in words. Raises TrapsError if there is no table."""
+    """Read the CSV of recorded pairs; return them and a sentence for each wrong line. Raises TrapsError without it."""
     tables = [path for name in TABLES if (path := folder / name).is_file()]
     if len(tables) != 1:
         raise TrapsError(

@@ -23,7 +23,7 @@ SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
 
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render a category's missing clips; return `make_together`'s result. Raises TrapsError."""
+    """Render missing clips; return the number of frames drawn, and whether all exist. Raises TrapsError."""
     specs = spec_rows(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:

@@ -57,7 +57,7 @@ SIDES = ("control", "void")
 
 
 def taxonomy_of(dataset: str) -> str:
-    """Return `occlusion` or `chaotic`."""
+    """Return the taxonomy of a dataset: `occlusion` or `chaotic`."""
     return dataset.removesuffix("_ill_posed")
 
 
@@ -76,7 +76,7 @@ def transfer_type(source: str, target: str) -> str:
 
 
 def taxonomy_of_category(category: str) -> str:
-    """Return `occlusion` or `chaotic`."""
+    """Return the taxonomy of a dataset: `occlusion` or `chaotic`."""
     return "chaotic" if category in (*CHAOTIC_CATEGORIES, "recorded_cut") else "occlusion"
 
 

@@ -56,12 +56,12 @@ class Card:
 
     @classmethod
     def read(cls, data: bytes) -> Card:
-        """Return the card that `data` serialized."""
+        """Read a report card from its JSON."""
         return cls(**json.loads(data))
 
     @property
     def data(self) -> bytes:
-        """The card as JSON, from which `read` makes it again."""
+        """The report card as JSON."""
         return json.dumps(asdict(self)).encode()
 
 
@@ -89,7 +89,7 @@ def explorer_address(behind: SourceItems) -> str:
 
 
 def table_card(report: TableReport, sources: Sources, address: LinkOf | None = explorer_address) -> Card:
-    """Return the card of a study's tables."""
+    """Return a report card that holds one or more tables of a study."""
     name = _name(report)
     try:
         tables = report.tables(sources.study)
@@ -121,7 +121,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: LinkOf | None) -> list[Mapping[str, object]]:
-    """Return each table's title (empty if the card's), fragment and downloads by name."""
+    """Return the HTML of a card's tables, each with its title and downloads by name."""
     return [
         {
             "title": table.title if table.title != title else "",

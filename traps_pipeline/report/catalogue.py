@@ -56,7 +56,7 @@ class TableReport:
 
     @property
     def make(self) -> Callable[[Results], list[PrintedTable]]:
-        """The function that makes it."""
+        """The function that makes the table from results."""
         return _function(f"tables.{self.function}")
 
     @property
@@ -66,7 +66,7 @@ class TableReport:
 
     @property
     def published(self) -> bool:
-        """Whether the paper has such a table."""
+        """Whether the paper prints a table of this name."""
         return self.paper or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
@@ -107,7 +107,7 @@ class TableReport:
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure.
+    """A figure of the report: its name, title and the function that draws it.
 
     reads: the stages whose tables it uses; published: whether the paper prints its numbers.
     frames: the frames of `Results` that it draws, if it is to be drawn again only when these change.
@@ -123,7 +123,7 @@ class FigureReport:
 
     @property
     def make(self) -> Callable[[Results], Figure]:
-        """The function that draws it."""
+        """The function that draws the figure from results."""
         return _function(f"figures.{self.function}")
 
     @property

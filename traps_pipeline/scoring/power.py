@@ -34,7 +34,7 @@ class Shares:
 
     @property
     def pecs(self) -> float:
-        """PECS of these three shares."""
+        """PECS from accuracy and the two shares of abstention."""
         return float(pecs_of(np.asarray(self.acc), np.asarray(self.abs_rec - self.false_abs)))
 
 
@@ -69,7 +69,7 @@ def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: in
 
 
 def scale_for(pairs: Mapping[str, int], width: float) -> float:
-    """Return how many times as many pairs of each dataset an interval of PECS of that width takes, to about 5 %."""
+    """Return by what factor to multiply the pairs so that PECS has an interval of a given width, to about 5 %."""
     scale = 1.0
     for _ in range(ROUNDS + 1):  # an interval shrinks with the square root of the pairs, but where they are few
         scale *= (_width(*_studies([max(1, round(scale * n)) for n in pairs.values()], Shares(), SEED)) / width) ** 2

@@ -84,7 +84,7 @@ class Annotation:
 
     @cached_property
     def failures(self) -> dict[str, dict[str, str]]:
-        """The content that the task `confabulation` shows, by unit."""
+        """The answers that people are asked to label for confabulation, by unit."""
         return {row["sample_id"]: row for row in sheet_rows(self.workspace)}
 
     def progress(self, who: str, task: TaskName) -> tuple[int, int]:

@@ -81,7 +81,7 @@ class TwoEventsSpec(_Record):
 
     @property
     def spec_hash(self) -> str:
-        """Digest of the whole record."""
+        """The digest of the whole record as JSON."""
         return digest(self.model_dump(mode="json"))
 
     def world(self, qpos: np.ndarray | None = None, twin_in: int | None = None) -> TwoLanes:

@@ -222,7 +222,7 @@ class SceneSpec(BaseModel):
 
     @property
     def spec_hash(self) -> str:
-        """Digest of the whole record."""
+        """The digest of the whole record as JSON."""
         return digest(self.model_dump(mode="json"))
 
 
