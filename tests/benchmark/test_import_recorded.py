@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.build.recorded import WORDS, ball, balls, film, table
+from tests.build.recorded import TWO_EVENTS, WORDS, ball, balls, film, table
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.footage import UnusableFootage
 from traps_pipeline.benchmark.import_recorded import RECORDS, import_recorded
 from traps_pipeline.benchmark.leaks import measure_leaks
 from traps_pipeline.benchmark.recorded_clips import clip_path, make_clips
 from traps_pipeline.benchmark.recorded_pairs import read_pairs
-from traps_pipeline.benchmark.records import is_recorded, load_released
+from traps_pipeline.benchmark.records import is_recorded, load_released, two_events_lines
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.video.encode import decode
 
@@ -95,6 +95,39 @@ def test_a_twin_proves_a_void_byte_for_byte_or_is_said_to_differ(tmp_path: Path,
     assert not np.array_equal(made.clips["twin"][-1], made.clips["control"][-1])
 
 
+def test_two_events_of_one_recording_are_hidden_by_themselves_both_or_not_at_all(tmp_path: Path) -> None:
+    made = clips_of(one(tmp_path, **TWO_EVENTS, control_cover="2.5 3 0 80 150 160|2.5 3 160 80 160 160"))
+    frames = {name: np.stack(clip) for name, clip in made.clips.items()}
+    assert {*frames} == {"neither", "left", "right", "both"}
+    halves = {name: (clip[:, :, :160], clip[:, :, 160:]) for name, clip in frames.items()}
+    # Each half shows the same whether or not the other one is hidden.
+    for half, same in enumerate((("neither", "right"), ("left", "both")), start=0):
+        assert np.array_equal(halves[same[0]][0], halves[same[1]][0]), half
+    assert np.array_equal(halves["neither"][1], halves["left"][1])
+    assert np.array_equal(halves["right"][1], halves["both"][1])
+    hidden = (frames["left"] != frames["neither"]).any(axis=-1)
+    assert hidden[12:25, 80:240, :150].any() and not hidden[:, :, 150:].any()
+    assert not hidden[25:].any()  # by then a board stands in each clip
+    assert made.void == {
+        "hides": [[(12, 30)]] * 2, "stands": [[(25, 30)]] * 2, "cover": [[0, 80, 150, 160], [160, 80, 160, 160]]
+    }  # fmt: skip
+
+
+def test_a_recording_of_two_events_becomes_eight_questions(tmp_path: Path) -> None:
+    folder, out = balls(tmp_path / "in", 1, events=1), tmp_path / "out"
+    (_, record), problems = import_recorded(folder, out, "some", workers=1)
+    assert problems == []
+    (line,) = two_events_lines(out / "two_events" / "released").values()
+    assert line.spec == record
+    asked = {(q.item.name, q.text.split(" reach")[0], q.answer) for q in line.spec.questions()}
+    red, blue = ("Which side does the red ball", "Which side does the blue ball")
+    assert asked == {
+        ("left.neither", red, "left"), ("right.neither", blue, "right"), ("left.left", red, None),
+        ("right.left", blue, "right"), ("left.right", red, "left"), ("right.right", blue, None),
+        ("left.both", red, None), ("right.both", blue, None),
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("row", "reason"),
     [
@@ -105,7 +138,7 @@ def test_a_twin_proves_a_void_byte_for_byte_or_is_said_to_differ(tmp_path: Path,
         ({"cut_s": "1", "choices": "left"}, "choices"),
         ({"cut_s": "1", "id": "Ball 1"}, "id"),
         ({"cut_s": "1", "aliases": "links"}, "other=choice"),
-        ({"cut_s": "1", "aliases": "links=rechts"}, "aliases name 'rechts'"),
+        ({"cut_s": "1", "aliases": "links=rechts"}, "unknown labels ['rechts']"),
         ({"cut_s": "1", "start_s": "2"}, "between start_s and end_s"),
         ({"cover": "2 1 0 0 90 90"}, "from_s to_s x y width height"),
         ({"cover": "1 2 0 0 90"}, "cover"),
@@ -119,7 +152,12 @@ def test_a_twin_proves_a_void_byte_for_byte_or_is_said_to_differ(tmp_path: Path,
         ({"cut_s": "2.9"}, "cut half a second or more"),
         ({"cover": "1 2 300 0 90 90"}, "leaves the picture, which is 320 x 240"),
         ({"cover": "9 10 0 0 90 90"}, "begins after the clip's end"),
-        ({"two_events": "yes", "cut_s": "1"}, "two_events are not imported yet"),
+        ({"two_events": "a|b", "cut_s": "1", "answer": "left|right"}, "and a cover for each"),
+        ({"two_events": "a|b", "cover": "1 2 0 0 90 90", "answer": "left"}, "two answers and two boards"),
+        ({"cover": "1 2 0 0 90 90|1 2 99 0 90 90"}, "a pair has one of each"),
+        (TWO_EVENTS | {"question": "Which side?"}, "for {} in the question"),
+        (TWO_EVENTS | {"two_events": "red|red"}, "two names"),
+        (TWO_EVENTS | {"cover": "1 2 0 0 90 90|1 2 80 0 90 90"}, "stand side by side"),
     ],
 )
 def test_a_wrong_line_gets_one_sentence(tmp_path: Path, row: dict[str, str], reason: str) -> None:

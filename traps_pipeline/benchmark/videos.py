@@ -7,6 +7,7 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.recorded_clips import copy_clips
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
@@ -37,7 +38,8 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
 
     def job(row: Row) -> Job | None:
         if row["family"] == RECORDED:
-            copy_clips(spec_of(row), zip(_sides(row), _clips(workspace, row), strict=True))
+            clips = dict(zip(_sides(row), _clips(workspace, row), strict=True))
+            copy_clips(RELEASED, row["scenario_id"], json.loads(row["params"])["clips"], clips)
             return None
         are_here = [is_here(clip, row) for clip in _clips(workspace, row)]
         return None if all(are_here) else _job(workspace, row)

@@ -15,6 +15,7 @@ from traps_pipeline.benchmark.corrections import load_two_events
 from traps_pipeline.benchmark.held_out import opaque
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
+from traps_pipeline.benchmark.stored_evidence import judged_certificates
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.registry.prompts import prompt, system_prompt
 from traps_pipeline.people.recorded_certificates import recorded_verdicts
@@ -32,8 +33,6 @@ from traps_pipeline.release.released_rows import (
     SplitRow,
     TwoEventsRow,
 )
-from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of, stored_evidence
-from traps_pipeline.scenes.certification.evidence import Claim
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
@@ -197,8 +196,6 @@ def certificate_rows(content: Content) -> list[CertificateRow]:
 
 
 def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]:
-    import numpy as np
-
     canary = content.release.canary
     if spec.is_recorded:
         failure = content.people[spec.scenario_id]
@@ -213,14 +210,7 @@ def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]
             canary=canary,
         )
         return
-    record_evidence, claim = stored_evidence(spec), Claim.of_record(spec)
-    empty_trajectory = np.empty((0, 0), np.float32)  # words are certified without a trajectory
-    for certificate in certificates_for(spec.void_kind):
-        words = certificate.about == "words"
-        evidence = (
-            {**certificate.measured(pair_of(spec, empty_trajectory, empty_trajectory))} if words else record_evidence
-        )
-        failure = certificate.failure(evidence, claim)
+    for certificate, evidence, failure in judged_certificates(spec):
         numbers = {n.name: evidence[n.name] for n in certificate.numbers if n.name in evidence}
         yield CertificateRow(
             scenario_id=spec.scenario_id,

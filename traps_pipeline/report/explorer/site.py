@@ -288,7 +288,9 @@ def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
             {
                 **{"scenario_id": scenario, "family": scenario.rpartition("-")[0], "fps": fps, "n_frames": n_frames},
                 "shown_at": max(k for k in range(n_frames) if standing[k] == min(standing)) / fps,
-                "lanes": [{"name": lane, "stands": evidence[lane]["stands"]} for lane in LANES],
+                "lanes": [
+                    {"name": n, "stands": evidence[n]["stands"], "hides": evidence[n].get("hides")} for n in LANES
+                ],
                 "clips": [{"name": n, "hidden": [*hidden], "path": path_of[n]} for n, hidden in LANE_CLIPS.items()],
                 "items": of_items,
             }

@@ -19,7 +19,7 @@ from traps_pipeline.scenes.picture.camera import WideCamera
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
 from traps_pipeline.scenes.worlds.lane_layout import Lane, Layout
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
-from traps_pipeline.scenes.worlds.spec import Slug, check_camera_and_physics
+from traps_pipeline.scenes.worlds.spec import Slug, check_camera_and_physics, check_labels
 
 
 class _Record(BaseModel):
@@ -42,6 +42,10 @@ class LaneRecord(_Record):
     layout: Layout
     ground_truth: str
     twin: LaneTwin
+
+    def asked(self, question: str) -> str:
+        """Return the family's question about this lane."""
+        return lane_question(self.lane.strip, question)
 
 
 class TwoEventsSpec(_Record):
@@ -67,7 +71,8 @@ class TwoEventsSpec(_Record):
         check_camera_and_physics(self.camera, self.physics)
         for record in self.lanes:
             answers = {record.ground_truth, record.twin.ground_truth}
-            if len(answers) < 2 or not answers <= {*self.labels}:
+            check_labels(self.labels, self.aliases, answers)
+            if len(answers) < 2:
                 raise ValueError(f"ground truths {sorted(answers)}: a lane and its twin have two of {self.labels}")
         if self.lanes[0].lane.strip == self.lanes[1].lane.strip:
             raise ValueError(f"both lanes have a {self.lanes[0].lane.strip} strip, so no question names one")
@@ -83,6 +88,11 @@ class TwoEventsSpec(_Record):
     def spec_hash(self) -> str:
         """Digest of the whole record."""
         return digest(self.model_dump(mode="json"))
+
+    @property
+    def sub_scenario(self) -> str:
+        """What both events are of."""
+        return get_family(self.family).sub_scenario
 
     def world(self, qpos: np.ndarray | None = None, twin_in: int | None = None) -> TwoLanes:
         """Return the world, or that with the twin in a lane. qpos: its frozen trajectory; None: to be simulated."""
@@ -101,8 +111,50 @@ class TwoEventsSpec(_Record):
         """Yield the eight items' questions, four of which can be answered."""
         for item in lane_items(self.scenario_id):
             record = self.lanes[LANES.index(item.lane)]
-            text = lane_question(record.lane.strip, self.question)
-            yield LaneQuestion(item, text, record.ground_truth)
+            yield LaneQuestion(item, record.asked(self.question), record.ground_truth)
+
+
+class RecordedLane(_Record):
+    """One of two recorded events: its name in the question, its answer, and between which frames a board stands.
+
+    cover: the board (px): x, y, width, height. hides: where the event is hidden; stands: where it is seen, maybe never.
+    """
+
+    name: str
+    ground_truth: str
+    cover: list[int] = Field(min_length=4, max_length=4)
+    hides: list[tuple[int, int]]
+    stands: list[tuple[int, int]]
+
+    def asked(self, question: str) -> str:
+        """Return the question about this event."""
+        return question.replace("{}", self.name)
+
+
+class RecordedEvents(TwoEventsSpec):
+    """Two events of a recording, which nobody simulated (docs/recorded.md). clips: their digests.
+
+    question: of both events; {} stands for the name of one.
+    """
+
+    seed: int = 0
+    camera: dict[str, Any] = {}
+    look: dict[str, Any] = {}
+    kind: str
+    clips: dict[str, str]
+    lanes: tuple[RecordedLane, RecordedLane]  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @model_validator(mode="after")
+    def _parts_agree(self) -> RecordedEvents:
+        check_labels(self.labels, self.aliases, [lane.ground_truth for lane in self.lanes])
+        if "{}" not in self.question:
+            raise ValueError("question: has no {} for the name of an event")
+        return self
+
+    @property
+    def sub_scenario(self) -> str:
+        """The category that the table gave."""
+        return self.kind
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import replace_file
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.protocol.datasets import RECORDED
 
 if TYPE_CHECKING:
@@ -104,6 +105,17 @@ class _RecordedVoid(_Strict):
     cover: list[int] | None = Field(default=None, min_length=4, max_length=4, description="x, y, width, height")
 
 
+def check_labels(labels: Sequence[str], aliases: Mapping[str, str], answers: Iterable[str]) -> None:
+    """Raise ValueError for a label that occurs twice, and for an answer or an alias of none of them."""
+    if len(set(labels)) != len(labels):
+        raise ValueError(f"labels {labels} repeat")
+    for answer in answers:
+        if answer not in labels:
+            raise ValueError(f"answer {answer!r} is not one of {labels}{did_you_mean(answer, labels)}")
+    if unknown_labels := sorted({*aliases.values()} - {*labels}):
+        raise ValueError(f"aliases point to unknown labels {unknown_labels}; labels are {labels}")
+
+
 class Answerable(BaseModel):
     """A question that both videos of the pair answer."""
 
@@ -165,13 +177,7 @@ class SceneSpec(BaseModel):
 
     @model_validator(mode="after")
     def _labels_agree(self) -> SceneSpec:
-        if self.ground_truth not in self.labels:
-            raise ValueError(f"ground_truth {self.ground_truth!r} is not one of the labels {self.labels}")
-        if len(set(self.labels)) != len(self.labels):
-            raise ValueError(f"labels {self.labels} repeat")
-        unknown_labels = sorted(set(self.aliases.values()) - set(self.labels))
-        if unknown_labels:
-            raise ValueError(f"aliases point to unknown labels {unknown_labels}; labels are {self.labels}")
+        check_labels(self.labels, self.aliases, [self.ground_truth])
         aside = self.answerable_question
         if aside is not None and aside.answer not in aside.labels:
             raise ValueError(f"answerable_question: answer {aside.answer!r} is not one of its labels")
