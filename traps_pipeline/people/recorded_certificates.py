@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from traps_pipeline.storage.parquet import TableStore
 
 NOT_CERTIFIED = "not certified"
+UNCERTIFIED = f"recorded pairs, {NOT_CERTIFIED}"
 
 
 def certification(labels: pd.DataFrame, scenario_ids: list[str]) -> dict[str, tuple[int, int]]:
@@ -53,6 +54,6 @@ def certification_note(tables: TableStore) -> str:
     if n_certified == len(verdicts):
         return f"recorded pairs: all {n_certified} certified by {people} people or more"
     return (
-        f"recorded pairs, {NOT_CERTIFIED}: {n_certified} of {count_noun(len(verdicts), 'scenario')} certified by "
+        f"{UNCERTIFIED}: {n_certified} of {count_noun(len(verdicts), 'scenario')} certified by "
         f"{people} people (run traps people annotate); answers of models certify nothing"
     )

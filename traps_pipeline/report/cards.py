@@ -160,14 +160,14 @@ def _failure(what: str, sources: Sources, error: Exception) -> str:
     return reason
 
 
-def picture_card(picture: Picture) -> Card:
-    """Return the card of pictures of clips."""
+def picture_card(picture: Picture, shows: str) -> Card:
+    """Return the card of pictures of clips, and what it says below them."""
     try:
         images = [_picture(name, figure, "webp") for name, figure in picture.figures().items()]
     except NotRun as reason:
         return Card(picture.name, picture.title, why=str(reason))
     pictures = {f"{k}" if k > 1 else "": image for k, image in enumerate(images, 1)}
-    return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title))
+    return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title), shows=shows)
 
 
 def _name(report: TableReport | FigureReport) -> str:

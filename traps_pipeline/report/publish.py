@@ -67,8 +67,15 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
         )
         for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
+    certified = sources.study.certified
     pictures = [
-        Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, lambda each=each: each.shown())
+        Part(
+            "pictures",
+            each.name,
+            lambda each=each: picture_card(each, certified),
+            each.reads,
+            lambda each=each: [each.shown(), certified],
+        )
         for each in PairPictures(sources.workspace).all()
     ]
     tables = [
