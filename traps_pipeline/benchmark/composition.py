@@ -86,7 +86,8 @@ def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None
         messages += _imbalances(family, members)
         messages += _repeated_questions(family, members)
         messages += _constant_margin(family, members)
-    messages += _repetitions(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
+    trajectories = [(spec.trajectory_sha256 + spec.scene_hash, spec.scenario_id) for spec in specs]
+    messages += repeated(trajectories, "the same trajectory")
     if counts is not None:
         messages += _predictable(specs)
     return messages
@@ -122,14 +123,12 @@ def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
 
-def _repetitions(
-    families: Mapping[str, Iterable[SceneSpec]], subject: str, key: Callable[[SceneSpec], str]
-) -> list[str]:
+def repeated(keys: Iterable[tuple[str, str]], problem: str) -> list[str]:
+    """Return a problem for each key that several scenarios have. keys: key and scenario id."""
     owners: defaultdict[str, list[str]] = defaultdict(list)
-    for members in families.values():
-        for spec in members:
-            owners[key(spec)].append(spec.scenario_id)
-    return [f"{', '.join(ids)}: the same {subject}" for ids in owners.values() if len(ids) > 1]
+    for key, scenario_id in keys:
+        owners[key].append(scenario_id)
+    return [f"{', '.join(ids)}: {problem}" for ids in owners.values() if len(ids) > 1]
 
 
 def _predictable(specs: Sequence[SceneSpec]) -> list[str]:

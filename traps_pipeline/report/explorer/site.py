@@ -276,7 +276,7 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
 def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
     """Return the data about scenarios of two events: clips, when boards stand, and items in the order of a page."""
     rows = {(row["scenario_id"], row["item"]): row for row in records(workspace.tables.read_all(ARMS))}
-    scenarios = []
+    scenarios, people = [], recorded_verdicts(workspace.tables)
     for scenario in sorted({id_ for (id_, _), row in rows.items() if row["arm"] == TWO_EVENTS}):
         row_of = {item: rows[scenario, item.name] for item in lane_items(scenario)}
         path_of = {item.clip: row["clip"] if row["clip"] in clips else None for item, row in row_of.items()}
@@ -293,6 +293,7 @@ def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
                 ],
                 "clips": [{"name": n, "hidden": [*hidden], "path": path_of[n]} for n, hidden in LANE_CLIPS.items()],
                 "items": of_items,
+                "certificate": people.get(scenario),
             }
         )
     return scenarios

@@ -83,6 +83,7 @@ async function lanesView(route, info, found, scene) {
         "and each is asked about. ",
         link(["answers"], { dataset: LANES_DATASET, scenario }, "All answers to this scene"),
       ),
+      scene.certificate ? h("p", null, scene.certificate) : null,
       neighbourLinks(around, "scene"),
       unknownModels(info, route.parameters, ["model", "model2"]),
       section(null, shown.element, boardKey(scene)),
