@@ -100,7 +100,7 @@ class Folder:
         """Return whether the figures say that pairs are not certified."""
         printed = self.python("-W", "ignore", "-c", FIGURES, self.study)
         said = json.loads(printed.stdout)
-        assert len(said) >= 5, printed.stderr
+        assert len(said) >= 2, printed.stderr
         return {*said}
 
 
@@ -115,6 +115,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Folder:
 
 def test_recorded_pairs_are_asked_certified_corrected_and_released(folder: Folder) -> None:
     assert "64 answers asked" in folder.run("two_way")  # 2 models, 6 scenarios of 4 items, and one of 8
+    folder.run("leaderboard")
     assert "not certified: 0 of 7" in folder.note()
     assert folder.figures() == {True}
     sampled = folder.python("-W", "ignore", "-c", LABEL, folder.study, *PEOPLE)

@@ -192,12 +192,14 @@ def two_events_rows(content: Content) -> list[TwoEventsRow]:
 
 def certificate_rows(content: Content) -> list[CertificateRow]:
     """Return one row per certificate and scenario, evaluated on the record's numbers."""
-    return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content)]
+    events = [spec for spec in content.two_events if spec.scenario_id in content.people]
+    specs = [*(spec_of(dict(row)) for row in content.specs), *events]
+    return [row for spec in specs for row in _certificates(spec, content)]
 
 
-def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]:
+def _certificates(spec: SceneSpec | TwoEventsSpec, content: Content) -> Iterable[CertificateRow]:
     canary = content.release.canary
-    if spec.is_recorded:
+    if isinstance(spec, TwoEventsSpec) or spec.is_recorded:
         failure = content.people[spec.scenario_id]
         yield CertificateRow(
             scenario_id=spec.scenario_id,

@@ -162,7 +162,7 @@ class FigureReport:
         is_by_rules = BY_RULES in results.judged_by.lower() and _is_judged(self.reads)
         said = [BY_RULES] * is_by_rules + [UNCERTIFIED] * results.certified.startswith(UNCERTIFIED)
         if said:
-            _say_below(figure, "; ".join(said))
+            _say_below(figure, "\n".join(said))
         return figure
 
 
@@ -266,7 +266,7 @@ def folder(kind: str, results: Results) -> str:
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at a figure's foot, or along its right edge if there is no room."""
+    """Write lines at a figure's foot, or along its right edge if there is no room."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     from traps_pipeline.report.writing import SOFT, figure_style
@@ -278,7 +278,8 @@ def _say_below(figure: Figure, text: str) -> None:
             figure.supxlabel(text, x=0.99, ha="right", **look)
             return
         if isinstance(engine, ConstrainedLayoutEngine):
-            engine.set(rect=(0, 0, 1 - RIGHT_EDGE_IN / figure.get_figwidth(), 1))
+            edge_in = RIGHT_EDGE_IN * (1 + text.count("\n"))
+            engine.set(rect=(0, 0, 1 - edge_in / figure.get_figwidth(), 1))
         figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
 
 
