@@ -264,6 +264,7 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
                 "labels": [*spec["labels"]],
                 "certificate": [words for _, words in certificate_phrases(evidence)]
                 + ([people[spec["scenario_id"]] or "certified by people"] if spec["scenario_id"] in people else []),
+                "by_people": spec["scenario_id"] in people,
                 "twin_answer": None if evidence.get("twin_px") else twin["ground_truth"] or None,
                 "twin_clip": twin_clip["path"] if twin_clip and not evidence.get("twin_px") else None,
                 "fps": control_clip["fps"] if control_clip else None,

@@ -43,7 +43,7 @@ function boardBars({ lanes, n_frames: frames, fps }, hidden) {
   const names = lanes.map(({ name }) => h("span", null, name));
   const element = h(
     "div",
-    { class: "boards" },
+    { class: boardsOf(lanes).length > 1 ? "boards" : "boards one" },
     h("div", { class: "names", "aria-hidden": "true" }, names),
     h("div", { class: "tracks" }, rows, now),
   );
