@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ import pytest
 from tests.build.recorded import TWO_EVENTS, WORDS, ball, balls, film, table
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.footage import UnusableFootage
-from traps_pipeline.benchmark.import_recorded import RECORDS, import_recorded
-from traps_pipeline.benchmark.leaks import measure_leaks
+from traps_pipeline.benchmark.import_recorded import RECORDS, RecordedSpec, import_recorded
+from traps_pipeline.benchmark.leaks import FILE, measure_leaks
 from traps_pipeline.benchmark.recorded_clips import clip_path, make_clips
 from traps_pipeline.benchmark.recorded_pairs import read_pairs
 from traps_pipeline.benchmark.records import is_recorded, load_released, two_events_lines
@@ -230,6 +231,10 @@ def test_a_benchmark_of_both_kinds_is_refused(tmp_path: Path) -> None:
             act()
 
 
+def pairs_of(records: Sequence[RecordedSpec]) -> list[SceneSpec]:
+    return [record for record in records if isinstance(record, SceneSpec)]
+
+
 def noisy(answer: str, number: int) -> list[np.ndarray]:
     """Return a ball's frames with a sensor's noise."""
     rng = np.random.default_rng([number, *answer.encode()])
@@ -239,7 +244,7 @@ def noisy(answer: str, number: int) -> list[np.ndarray]:
 
 def test_a_leak_that_was_planted_is_found(tmp_path: Path) -> None:
     """Voids that were encoded twice, coarsely, differ in detail from all controls; others do not."""
-    p_of_detail = {}
+    j_of_detail = {}
     for planted in (False, True):
         folder, rows = tmp_path / str(planted), []
         for k in range(6):
@@ -250,10 +255,11 @@ def test_a_leak_that_was_planted_is_found(tmp_path: Path) -> None:
             rows.append({"id": f"balls-{k}", "control": f"{k}.mp4", "void": f"{k}v.mp4", "answer": "left"})
         records, problems = import_recorded(table(folder, rows), folder / "out", "some", workers=1)
         assert problems == []
-        lines = measure_leaks(records, folder / "out").splitlines()
-        p_of_detail[planted] = float([line for line in lines if line.startswith("detail")][-1].split()[-1])
-    assert p_of_detail[True] == pytest.approx(2 / 2**6, abs=0.001)  # as if a coin fell alike six times
-    assert p_of_detail[False] > 0.05
+        measure_leaks(pairs_of(records), folder / "out")
+        rows = json.loads((folder / "out" / FILE).read_text(encoding="utf-8"))
+        (j_of_detail[planted],) = (row["j"] for row in rows if row["cue"] == "detail")
+    assert j_of_detail[True] == 1
+    assert j_of_detail[False] < 0.5
 
 
 def test_the_same_clip_under_two_names_is_a_near_duplicate(tmp_path: Path) -> None:
@@ -263,7 +269,7 @@ def test_the_same_clip_under_two_names_is_a_near_duplicate(tmp_path: Path) -> No
         film(folder / f"{k}.mp4", ball("left", number), options={"crf": str(16 + k), "preset": "ultrafast"})
         rows.append({"id": f"balls-{k}", "control": f"{k}.mp4", "answer": "left", "cut_s": "1.2"})
     records, _ = import_recorded(table(folder, rows), tmp_path / "out", "some", workers=1)
-    lines = [line for line in measure_leaks(records, tmp_path / "out").splitlines() if "nearly" in line]
+    lines = [line for line in measure_leaks(pairs_of(records), tmp_path / "out").splitlines() if "nearly" in line]
     assert [line.split(":")[0] for line in lines] == ["balls-0 and balls-2"]
 
 

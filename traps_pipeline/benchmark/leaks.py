@@ -28,8 +28,6 @@ _TINY, _ALIKE_LEVELS = (16, 12), 8  # size of a near duplicate's pictures, by ho
 
 def measure_leaks(records: Sequence[SceneSpec], out: Path) -> str:
     """Write FILE below `out`: a row a cue and dataset; return tables and remarks as lines of text."""
-    from scipy.stats import binomtest
-
     looks = {
         (r.scenario_id, side): _look(clip_path(out / "released", r.scenario_id, side))
         for r in records
@@ -40,10 +38,6 @@ def measure_leaks(records: Sequence[SceneSpec], out: Path) -> str:
     cells = [(row["dataset"], row["cue"], row["n_pairs"], f"{row['j']:+.2f} ± {row['half_width']:.2f}") for row in rows]
     lines = [text_table(("dataset", "cue alone", "pairs", "J, held-out pairs"), cells, left=(0, 1))] if rows else []
     lines += [] if rows else [f"what gives voids away: not measured, since no dataset has {FOLDS} pairs"]
-    void, control = (np.array([looks[r.scenario_id, side]["numbers"] for r in records]) for side in ("void", "control"))
-    counts = zip(NUMBERS, (void < control).sum(axis=0).tolist(), (void != control).sum(axis=0).tolist(), strict=True)
-    signs = [(name, n, of, f"{binomtest(n, of).pvalue if of else 1:.3f}") for name, n, of in counts]
-    lines.append(text_table(("within pairs", "void lower", "of", "p of a coin"), signs))
     alone = sum("cover" in spec.void and "control_cover" not in spec.evidence for spec in records)
     board = f"a board comes in the void alone in {count_noun(alone, 'pair')}, which tells sides: give control_cover"
     return "\n".join([*lines, *([board] if alone else []), *_near_duplicates(looks)])
