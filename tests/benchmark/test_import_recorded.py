@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.import_recorded import RECORDS, RecordedSpec, impo
 from traps_pipeline.benchmark.leaks import FILE, measure_leaks
 from traps_pipeline.benchmark.recorded_clips import clip_path, make_clips
 from traps_pipeline.benchmark.recorded_pairs import read_pairs
-from traps_pipeline.benchmark.records import is_recorded, load_released, two_events_lines
+from traps_pipeline.benchmark.records import is_recorded, load_released, parse_two_events, two_events_lines
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.video.encode import decode
 
@@ -118,8 +118,12 @@ def test_a_recording_of_two_events_becomes_eight_questions(tmp_path: Path) -> No
     folder, out = balls(tmp_path / "in", 1, events=1), tmp_path / "out"
     (_, record), problems = import_recorded(folder, out, "some", workers=1)
     assert problems == []
-    (line,) = two_events_lines(out / "two_events" / "released").values()
+    released = out / "two_events" / "released"
+    (line,) = two_events_lines(released).values()
     assert line.spec == record
+    for name, value in (("clips", {"both": "0"}), ("question", "Where?"), ("physics", {"fps": 10})):
+        with pytest.raises(TrapsError, match=name):
+            parse_two_events(json.dumps(json.loads(line.line) | {name: value}), "line 1")
     asked = {(q.item.name, q.text.split(" reach")[0], q.answer) for q in line.spec.questions()}
     red, blue = ("Which side does the red ball", "Which side does the blue ball")
     assert asked == {

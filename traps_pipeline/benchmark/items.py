@@ -26,8 +26,9 @@ from traps_pipeline.protocol.datasets import (
     taxonomy_of_category,
 )
 from traps_pipeline.protocol.two_events import LANES, LaneItem
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.worlds.clip_notes import check_clip
-from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+from traps_pipeline.scenes.worlds.lane_records import RecordedEvents, TwoEventsSpec
 from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.storage.tables import records
@@ -136,7 +137,7 @@ def _lane_items(workspace: Workspace) -> list[ItemRow]:
     if lost := {*specs} - {row["scenario_id"] for row in rows}:
         raise TrapsError(f"items {TWO_EVENTS}: {min(lost)} was not filmed; materialize arms")
     answers = [
-        {"sub_scenario": spec.sub_scenario, "ground_truth": lane.ground_truth}
+        {"sub_scenario": _sub_scenario(spec), "ground_truth": lane.ground_truth}
         for spec in specs.values()
         for lane in spec.lanes
     ]
@@ -144,9 +145,13 @@ def _lane_items(workspace: Workspace) -> list[ItemRow]:
     return [_lane_item(specs[row["scenario_id"]], row, commonest, version) for row in rows]
 
 
+def _sub_scenario(spec: TwoEventsSpec) -> str:
+    return spec.kind if isinstance(spec, RecordedEvents) else get_family(spec.family).sub_scenario
+
+
 def _lane_item(spec: TwoEventsSpec, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
     item = LaneItem(spec.scenario_id, *str(row["item"]).split("."))
-    words = {"sub_scenario": spec.sub_scenario, "labels": row["labels"], "aliases": json.dumps(spec.aliases)}
+    words = {"sub_scenario": _sub_scenario(spec), "labels": row["labels"], "aliases": json.dumps(spec.aliases)}
     decisive = _decisive(
         {**spec.model_dump(exclude={"lanes"}), **words, "taxonomy": taxonomy_of_category(spec.category)},
         dataset=TWO_EVENTS,

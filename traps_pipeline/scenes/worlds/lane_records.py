@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.protocol.two_events import LANES, LaneItem, lane_items
+from traps_pipeline.protocol.two_events import CLIPS, LANES, LaneItem, lane_items
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import Look
 from traps_pipeline.scenes.parts.wording import lane_question
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.picture.camera import WideCamera
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
 from traps_pipeline.scenes.worlds.lane_layout import Lane, Layout
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
-from traps_pipeline.scenes.worlds.spec import Slug, check_camera_and_physics, check_labels
+from traps_pipeline.scenes.worlds.spec import Footage, Slug, check_camera_and_physics, check_labels, checked
 
 
 class _Record(BaseModel):
@@ -89,11 +89,6 @@ class TwoEventsSpec(_Record):
         """Digest of the whole record."""
         return digest(self.model_dump(mode="json"))
 
-    @property
-    def sub_scenario(self) -> str:
-        """What both events are of."""
-        return get_family(self.family).sub_scenario
-
     def world(self, qpos: np.ndarray | None = None, twin_in: int | None = None) -> TwoLanes:
         """Return the world, or that with the twin in a lane. qpos: its frozen trajectory; None: to be simulated."""
         family, physics = get_family(self.family), Physics(**self.physics)
@@ -132,9 +127,9 @@ class RecordedLane(_Record):
 
 
 class RecordedEvents(TwoEventsSpec):
-    """Two events of a recording, which nobody simulated (docs/recorded.md). clips: their digests.
+    """Two events of a recording, which nobody simulated (docs/recorded.md).
 
-    question: of both events; {} stands for the name of one.
+    kind: the table's category. clips: their digests. question: of both events; {} stands for the name of one.
     """
 
     seed: int = 0
@@ -147,14 +142,10 @@ class RecordedEvents(TwoEventsSpec):
     @model_validator(mode="after")
     def _parts_agree(self) -> RecordedEvents:
         check_labels(self.labels, self.aliases, [lane.ground_truth for lane in self.lanes])
-        if "{}" not in self.question:
-            raise ValueError("question: has no {} for the name of an event")
+        checked(Footage, "physics", self.physics)
+        if "{}" not in self.question or {*self.clips} != {*CLIPS}:
+            raise ValueError(f"question: needs {{}} for the name of an event, and clips: each of {', '.join(CLIPS)}")
         return self
-
-    @property
-    def sub_scenario(self) -> str:
-        """The category that the table gave."""
-        return self.kind
 
 
 @dataclass(frozen=True)
