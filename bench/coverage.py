@@ -27,14 +27,14 @@ from bench.quick import parse
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED_FIGURES,
+    RESAMPLED_METRICS,
     TAXONOMIES,
     Resampling,
     difference,
     draw_scenarios,
-    figures_of,
     interval,
     limits_of,
+    metrics_of,
     quantile,
     resampled_sums,
     scenario_weights,
@@ -72,8 +72,8 @@ LANES = ("other event seen", "other event hidden")  # two events: controls have 
 STUDIES, RESAMPLES, PARTS = 25, 1000, 12
 N_FAMILIES = 8
 FIGURES = (
-    *(f"{name}, one dataset" for name in RESAMPLED_FIGURES),
-    *RESAMPLED_FIGURES,
+    *(f"{name}, one dataset" for name in RESAMPLED_METRICS),
+    *RESAMPLED_METRICS,
     "specificity",
     "difference of j",
     "difference of pecs",
@@ -133,7 +133,7 @@ def cell_figures(counts: np.ndarray, drawn: Resampling, taxonomy: str, named: st
     sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
     having = (counts[..., 1::2] > 0).sum(axis=0)
     whole = with_unseen(sums.reshape(studies, runs, kinds, -1), having, drawn.unseen(named, kinds // 2))
-    return np.moveaxis(figures_of(whole, in_mean).mean(axis=2), 0, 1)
+    return np.moveaxis(metrics_of(whole, in_mean).mean(axis=2), 0, 1)
 
 
 def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) -> dict[str, np.ndarray]:
@@ -143,17 +143,17 @@ def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) ->
         return cell_figures(counts[name], drawn, _taxonomy(name), f"{model}|{name}", in_mean)
 
     of_one = ends_of(next(iter(counts)), in_mean=False)
-    ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED_FIGURES)}
+    ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED_METRICS)}
     if all(name in counts for name in LANES):
         seen, hidden = (ends_of(name, in_mean=False) for name in LANES)
         asked, other = (
-            own[:, :, RESAMPLED_FIGURES.index(figure)] for own, figure in ((seen, "abs_rec"), (hidden, "false_abs"))
+            own[:, :, RESAMPLED_METRICS.index(figure)] for own, figure in ((seen, "abs_rec"), (hidden, "false_abs"))
         )
         ends["specificity"] = difference(asked, other)
     if not all(name in counts for name in DATASETS):
         return ends
     overall = np.mean([ends_of(name, in_mean=True) for name in DATASETS], axis=0)
-    return ends | {name: overall[:, :, k] for k, name in enumerate(RESAMPLED_FIGURES)}
+    return ends | {name: overall[:, :, k] for k, name in enumerate(RESAMPLED_METRICS)}
 
 
 def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -165,19 +165,19 @@ def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndar
         with np.errstate(invalid="ignore"):
             acc, false_abs, abs_rec = np.moveaxis(sums[:, 0::2] / sums[:, 1::2], 1, 0)
         stacked = np.stack([metric.formula(acc, false_abs, abs_rec) for metric in METRIC_WORDS.values()])
-        figures[name] = stacked.reshape(len(RESAMPLED_FIGURES), studies, runs, -1).mean(axis=2)
+        figures[name] = stacked.reshape(len(RESAMPLED_METRICS), studies, runs, -1).mean(axis=2)
     first = next(iter(figures.values()))
-    draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED_FIGURES)}
+    draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED_METRICS)}
     if all(name in figures for name in LANES):
         asked, other = (
-            figures[name][RESAMPLED_FIGURES.index(figure)]
+            figures[name][RESAMPLED_METRICS.index(figure)]
             for name, figure in zip(LANES, ("abs_rec", "false_abs"), strict=True)
         )
         draws["specificity"] = asked - other
     if not all(name in figures for name in DATASETS):
         return draws
     overall = np.mean([figures[name] for name in DATASETS], axis=0)
-    return draws | {name: overall[k] for k, name in enumerate(RESAMPLED_FIGURES)}
+    return draws | {name: overall[k] for k, name in enumerate(RESAMPLED_METRICS)}
 
 
 def _taxonomy(name: str) -> str:

@@ -28,7 +28,7 @@ from bench.quick import parse
 from traps_pipeline.benchmark.items import build_items
 from traps_pipeline.benchmark.specs import build_specs
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
-from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, decide
+from traps_pipeline.judging.verdicts import ITEM_COLUMNS, RESPONSE_COLUMNS, verdicts_of
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import CATEGORIES, DATASETS
@@ -116,7 +116,7 @@ def made_study(folder: Path, models: int) -> Workspace:
         for dataset in DATASETS:
             cell = Cell(dataset, evaluation)
             responses, votes = _cell(items.loc[items["dataset"] == dataset], cell, seed=number)
-            own = decide(items.loc[:, ITEM_COLUMNS], responses.loc[:, RESPONSE_COLUMNS], votes)
+            own = verdicts_of(items.loc[:, ITEM_COLUMNS], responses.loc[:, RESPONSE_COLUMNS], votes)
             for table, rows in ((RESPONSES, responses), (VOTES, votes), (VERDICTS, own)):
                 _write(workspace, table, cell.partition, rows)
             verdicts.append(own)

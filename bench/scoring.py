@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from bench.quick import parse
-from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.judging.verdicts import verdicts_of
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import intervals, resample
@@ -39,7 +39,7 @@ def main() -> None:
     items, responses, votes = study(arguments.models)
     print(f"{len(responses) // 2:,} pairs, {len(votes):,} votes")
     began = time.perf_counter()
-    verdicts = timed("votes to verdicts", lambda: decide(items, responses, votes))
+    verdicts = timed("votes to verdicts", lambda: verdicts_of(items, responses, votes))
     metrics = timed(
         "metrics",
         lambda: pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset")], ignore_index=True),
@@ -71,7 +71,7 @@ def timed(what: str, work: Callable[[], Any]) -> Any:
 
 
 def study(models: int) -> tuple[Any, Any, Any]:
-    """Return items, responses and votes of a made-up study, with the columns that `decide` reads."""
+    """Return items, responses and votes of a made-up study, with the columns that `verdicts_of` reads."""
     rng = np.random.default_rng(0)
     items = pd.DataFrame(
         [

@@ -12,7 +12,7 @@ import numpy as np
 from tools.tiny_checkpoints import FAMILIES, Family, build_tiny
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.registry.entries import ModelEntry
-from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.media import MediaSpec, pick_frames
 from traps_pipeline.video.encode import encode
 
 __all__ = ["FAMILIES", "Family"]
@@ -62,7 +62,7 @@ def model(family: Family, **params: Any) -> LocalModel:
 
 def ask(of: LocalModel, question: str = QUESTIONS[0], frames: int = 6) -> Prompt:
     """A prompt about the clip."""
-    shown = sample(clip(), MediaSpec(profile="frames", uniform=frames))
+    shown = pick_frames(clip(), MediaSpec(profile="frames", uniform=frames))
     return of.prompt(SYSTEM, question, shown.frames, shown.times_s)
 
 

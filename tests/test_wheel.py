@@ -165,9 +165,9 @@ def test_a_command_that_wants_more_is_one_sentence(installed: Installed, command
 def test_the_shipped_benchmark_is_not_changed_and_a_copy_of_it_is(installed: Installed) -> None:
     code = (
         "from datetime import date; from traps_pipeline.base.errors import TrapsError\n"
-        "from traps_pipeline.benchmark.decisions import Correction, decide\n"
+        "from traps_pipeline.benchmark.decisions import Correction, save_decision\n"
         "kept = Correction(scenario_id='plinko-0001', action='keep', who='jd', when=date(2026, 11, 22), why='test')\n"
-        "try: decide(kept, 0)\n"
+        "try: save_decision(kept, 0)\n"
         "except TrapsError as error: raise SystemExit(str(error))"
     )
     before = {path: path.stat().st_mtime_ns for path in installed.shipped.rglob("*")}

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from traps_pipeline.report.contact_sheet import Layout, pairs_figure
-from traps_pipeline.report.figures.looks import family_colour, family_of
+from traps_pipeline.report.figures.looks import family_colour, model_family
 from traps_pipeline.report.writing import INK, SOFT, figure_bytes, figure_style, new_figure
 from traps_pipeline.scoring.published import published_overall
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -88,7 +88,7 @@ def finding() -> bytes:
         figure = new_figure(4.6, 3.6, dpi=220)
         axes = figure.add_subplot()
         for y, (model, row) in enumerate(shares.iterrows()):
-            colour = family_colour(family_of(str(model)))
+            colour = family_colour(model_family(str(model)))
             axes.plot([row["standard"], row["guided"]], [y, y], color=colour, linewidth=1.2, zorder=1)
             axes.scatter(row["standard"], y, s=26, facecolors="white", edgecolors=colour, zorder=2)
             axes.scatter(row["guided"], y, s=26, color=colour, zorder=2)

@@ -19,7 +19,7 @@ import numpy as np
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.scenes.certification.certificates import WORDS, certificates_for, pair_of
-from traps_pipeline.scenes.draw.resolve import Resolved, plain
+from traps_pipeline.scenes.draw.resolve import Resolved, json_values
 from traps_pipeline.scenes.draw.sample import (
     Draw,
     Tally,
@@ -163,10 +163,10 @@ def _redraw_look(job: _Job) -> Resolved | str:
 def with_look(spec: SceneSpec, look: Look | None, qpos: np.ndarray, twin: np.ndarray) -> SceneSpec | str:
     """Return a record under a look in STILL, or the certificate it then loses."""
     family = get_family(spec.family)
-    params = plain(params_to_dict(replace(family.params_from(spec.params), look=look)))
+    params = json_values(params_to_dict(replace(family.params_from(spec.params), look=look)))
     twin_params = spec.twin.params
     if twin_params is not None:
-        twin_params = plain(params_to_dict(replace(family.params_from(twin_params), look=look)))
+        twin_params = json_values(params_to_dict(replace(family.params_from(twin_params), look=look)))
     record = spec.model_copy(update={"params": params, "twin": spec.twin.model_copy(update={"params": twin_params})})
     pair, evidence = pair_of(record, qpos, twin), dict(spec.evidence)
     for certificate in certificates_for(spec.void_kind):

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.keys import optional_key
 
 # Environment variables that obstore reads, by kind of store.
@@ -33,7 +33,7 @@ class Bucket:
     """A place in an object store, such as s3://bucket/study (TRAPS_WORKSPACE)."""
 
     def __init__(self, address: str) -> None:
-        require("cluster", "obstore")
+        require_extra("cluster", "obstore")
         from obstore.store import from_url
 
         self.address, self._kind = address, address.partition(":")[0]

@@ -23,7 +23,7 @@ from traps_cluster.bucket import Bucket, object_name
 from traps_cluster.object_names import CurrentObject, ObjectNames
 from traps_cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import is_same_file, link, write_bytes
+from traps_pipeline.base.files import is_same_file, replace_by_link, write_bytes
 from traps_pipeline.storage.place import STUDY, Place
 from traps_pipeline.storage.store import GRACE_DAYS, FolderStore, Store, UnusedObject, is_hidden
 from traps_pipeline.storage.study import FORMAT, Study
@@ -117,7 +117,7 @@ class ObjectStore(Store):
             path, row = known
             cached = self._fetched(row)
             if cached is not None and not is_same_file(path, cached):
-                link(cached, path)
+                replace_by_link(cached, path)
 
         _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
 
@@ -148,7 +148,7 @@ class ObjectStore(Store):
     def _put(self, path: Path, content: bytes, note: str | None = None) -> CurrentObject:
         """Upload a content, and link it to its path; return its object, which is not yet named."""
         new = CurrentObject(sha256(content).digest(), len(content), note)
-        link(self._cache(new.digest, content), path)
+        replace_by_link(self._cache(new.digest, content), path)
         self.bucket.put(object_name(new.digest), content)
         self._stored.add(new.digest)
         return new

@@ -26,7 +26,7 @@ from typing_extensions import override
 
 from traps_pipeline.base.databases import is_damaged, reason_and_remedy
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.keys import check_key
 from traps_pipeline.ledger.database import Database, Lock, taken_over
 from traps_pipeline.ledger.schema import EVALUATIONS, METADATA, SESSIONS, STUDIES
@@ -295,5 +295,5 @@ def open_ledger(variable: str, study: str) -> PostgresDatabase:
 
 @cache
 def _opened(_pid: int, address: str, variable: str, study: str) -> PostgresDatabase:
-    require("cluster", "psycopg")
+    require_extra("cluster", "psycopg")
     return PostgresDatabase(address, variable, study)

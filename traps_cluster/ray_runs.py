@@ -25,13 +25,13 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.cores import CORES
 from traps_pipeline.base.databases import database_error
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import missing
+from traps_pipeline.base.extras import find_missing
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.entries import LOCAL, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.metadata import tally_of
-from traps_pipeline.pipeline.ranges import Range, cut, shared_out
+from traps_pipeline.pipeline.ranges import Range, cut_keys, shared_out
 from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, keys_of, problems_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, UNWANTED
 from traps_pipeline.protocol.cells import Cell
@@ -76,7 +76,7 @@ def require_cluster(workspace: Workspace, instance: dg.DagsterInstance) -> None:
     Other hosts must see the study, Ray's address must be known, and a daemon must take runs from the queue.
     """
     where = f"the host {socket.gethostname()} submits no runs of the study {workspace.study.name}: "
-    if absent := missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
+    if absent := find_missing("cluster", "ray", "dagster_ray", "dagster_postgres"):
         raise TrapsError(
             f"{where}runs on other hosts need {' and '.join(absent)} here and there: install the extra `cluster`, in a "
             "checkout `python -m pip install --no-deps --require-hashes -r requirements-cluster.lock`"
@@ -144,7 +144,7 @@ class RayRuns(Runs):
         scheme = stages[0].scheme if stages else None
         shared = [stage.shared for stage in stages if stage.shared is not None]
         if not shared:
-            return cut(scheme, keys, self._most)
+            return cut_keys(scheme, keys, self._most)
         seconds = {key: sum(each.seconds(self._workspace, key) for each in shared) / self._cpus for key in keys}
         return shared_out(scheme, keys, seconds, self._most)
 

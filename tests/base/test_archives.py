@@ -10,27 +10,27 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.base.archives import BadArchive, pack, reading_archive, unpack
+from traps_pipeline.base.archives import BadArchive, reading_archive, unzip_bytes, zip_bytes
 
 MEMBERS = {"notes.json": b'{"a": [1, 2]}', "page": bytes(random.Random(0).choices(b"<td> 01", k=300)), "empty": b""}
 
 
 @pytest.mark.parametrize("level", [0, 1])
 def test_equal_members_give_equal_bytes_and_come_back_in_their_order(level: int) -> None:
-    data = pack(MEMBERS, level=level)
-    assert data == pack(MEMBERS, level=level)
-    assert [*unpack(data).items()] == [*MEMBERS.items()]
+    data = zip_bytes(MEMBERS, level=level)
+    assert data == zip_bytes(MEMBERS, level=level)
+    assert [*unzip_bytes(data).items()] == [*MEMBERS.items()]
 
 
 @pytest.mark.parametrize("level", [0, 1])
 def test_a_flip_of_any_bit_is_damage_or_changes_no_content(level: int) -> None:
-    data, seen = pack(MEMBERS, level=level), Counter[str]()
+    data, seen = zip_bytes(MEMBERS, level=level), Counter[str]()
     for bit in range(8 * len(data)):
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
         try:
             seen["read"] += 1
-            members = unpack(bytes(flipped))
+            members = unzip_bytes(bytes(flipped))
         except BadArchive:
             seen["damaged"] += 1
             continue
@@ -46,7 +46,7 @@ def test_damage_within_a_member_of_any_method_is_damage(method: int) -> None:
     data = bytearray(stream.getvalue())
     data[36:80] = bytes(44)
     with pytest.raises(BadArchive):
-        unpack(bytes(data))
+        unzip_bytes(bytes(data))
 
 
 def test_a_file_that_cannot_be_opened_is_no_damage(tmp_path: Path) -> None:

@@ -86,7 +86,8 @@ def test_the_bill_of_materials_names_every_pin_and_is_written_twice_to_the_same_
     [("api", ["litellm"]), ("web", ["fastapi", "uvicorn"])],
 )
 def test_a_missing_extra_is_one_sentence_with_the_line_to_type(name: ExtraName, blocked: list[str]) -> None:
-    code = f"{BLOCK.format(blocked=blocked)}\nfrom traps_pipeline.base.extras import require; require({name!r})"
+    line = f"from traps_pipeline.base.extras import require_extra; require_extra({name!r})"
+    code = f"{BLOCK.format(blocked=blocked)}\n{line}"
     finished = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert finished.returncode == 1
     told = finished.stderr.splitlines()[-1]

@@ -24,7 +24,7 @@ import pytest
 
 import traps_pipeline
 from traps_pipeline.base.redaction import redact
-from traps_pipeline.base.terminal import plain, visible
+from traps_pipeline.base.terminal import escape_invisible, plain
 from traps_pipeline.judging.panel import parse_vote
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.reading.interpret import read_answer
@@ -290,7 +290,7 @@ def _read(outcome: str, regime: str, start: str = "") -> Callable[[str], object]
 
 READERS: dict[str, Callable[[str], object]] = {
     "redact": redact,
-    "visible": visible,
+    "visible": escape_invisible,
     "plain": plain,
     "truncated": _read("truncated", "standard"),
     "truncated object": _read("truncated", "json", '{"reason": "x", '),

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from tests.build.processes import MARK, marked, wait_until_gone
-from traps_pipeline.base.process_tree import split
+from traps_pipeline.base.process_tree import fork_worker
 
 END_S = 60  # more than nine times what it takes
 # A command of two processes. Below the second one: a program that ends at SIGTERM, which has started one in a session
 # of its own that ignores it. The last to start writes the second process's id.
 COMMAND = '''
 import os, signal, subprocess, sys, time
-from traps_pipeline.base.process_tree import split, stop_descendants, wait_for
+from traps_pipeline.base.process_tree import fork_worker, stop_descendants, wait_for
 from traps_pipeline.cli import _stop_on_signals
 
 SLEEPS = """
@@ -33,7 +33,7 @@ import subprocess, sys
 subprocess.Popen([sys.executable, "-c", *sys.argv[1:]], start_new_session=True).wait()
 """
 with _stop_on_signals():
-    if (code := split(3)) is not None:
+    if (code := fork_worker(3)) is not None:
         sys.exit(code % 256)
     child = subprocess.Popen([sys.executable, "-c", STARTS, SLEEPS, sys.argv[1], str(os.getpid())])
     try:
@@ -73,7 +73,7 @@ def test_a_stop_of_either_process_ends_all_that_both_started(
 
 def test_the_first_process_ends_with_the_code_of_the_second() -> None:
     script = (
-        "import sys; from traps_pipeline.base.process_tree import split; code = split(5); "
+        "import sys; from traps_pipeline.base.process_tree import fork_worker; code = fork_worker(5); "
         "sys.exit(7 if code is None else code)"
     )
     assert subprocess.run([sys.executable, "-c", script]).returncode == 7
@@ -81,4 +81,4 @@ def test_the_first_process_ends_with_the_code_of_the_second() -> None:
 
 def test_another_system_gets_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert split(1) is None
+    assert fork_worker(1) is None

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from tests.build.errors import raises
 from tests.conftest import ROOT
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain, read_lines, read_yaml
+from traps_pipeline.base.yamlfile import faults_of, read_lines, read_yaml
 from traps_pipeline.models.registry.accounts import Account, Prices
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.user_registry import UserRegistry
@@ -144,7 +144,7 @@ def test_no_sentence_of_the_validator_reaches_a_person(kind: type[BaseModel]) ->
         try:
             kind.model_validate(fields, context={"accounts": {}})
         except ValidationError as error:
-            text, n_refused = explain(error, kind), n_refused + 1
+            text, n_refused = faults_of(error, kind), n_refused + 1
             own = [details["msg"] for details in error.errors() if details["type"] != "value_error"]
             assert text and not any(sentence in text for sentence in own), f"{fields}: {text}"
             assert "{" not in re.sub(r"not [\[{'].*", "", text), text  # a gap that nothing fills

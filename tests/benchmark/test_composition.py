@@ -17,7 +17,7 @@ from bench.lite import chosen
 from tests.conftest import ROOT, Checkout
 from traps_pipeline.base.paths import ASSETS, RELEASED
 from traps_pipeline.benchmark.certify_all import foreseeable
-from traps_pipeline.benchmark.composition import load_composition, prior_accuracy, problems
+from traps_pipeline.benchmark.composition import composition_problems, load_composition, prior_accuracy
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.stored_evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
 from traps_pipeline.scenes.certification.certify_record import Verdict, state_at_cut
@@ -74,32 +74,32 @@ def is_one(problems: Iterable[str], *names: str) -> bool:
 
 
 def test_an_answer_may_come_once_more_than_the_even_split() -> None:
-    assert problems(race("yyyyynnn")) == []
-    assert is_one(problems(race("yyyyyynn")), "domino_chain", "'yes'", "6", "5")
+    assert composition_problems(race("yyyyynnn")) == []
+    assert is_one(composition_problems(race("yyyyyynn")), "domino_chain", "'yes'", "6", "5")
 
 
 def test_of_ten_or_more_an_answer_of_two_may_be_60_percent() -> None:
-    assert problems(race("y" * 12 + "n" * 8)) == []
-    assert is_one(problems(race("y" * 13 + "n" * 7)), "domino_chain", "'yes'", "13", "12")
+    assert composition_problems(race("y" * 12 + "n" * 8)) == []
+    assert is_one(composition_problems(race("y" * 13 + "n" * 7)), "domino_chain", "'yes'", "13", "12")
 
 
 def test_a_text_or_a_scene_that_occurs_twice_is_named() -> None:
     specs = race("ynyn")
     twice = [*specs[:3], specs[3].model_copy(update={"ill_posed_question": specs[0].ill_posed_question})]
-    assert is_one(problems(twice), "domino_chain", "'How many grams does domino 0 weigh?'", "2", "1")
+    assert is_one(composition_problems(twice), "domino_chain", "'How many grams does domino 0 weigh?'", "2", "1")
     copied = [*specs[:3], specs[0].model_copy(update={"scenario_id": "domino_chain-0099", "ill_posed_question": "?"})]
-    assert is_one(problems(copied), "domino_chain-0000, domino_chain-0099")
+    assert is_one(composition_problems(copied), "domino_chain-0000, domino_chain-0099")
 
 
 def test_a_family_whose_margin_is_a_constant_is_named() -> None:
     constant = [spec.model_copy(update={"evidence": spec.evidence | {"margin_m": 1.0}}) for spec in race("ynyn")]
-    assert is_one(problems(constant), "domino_chain", "1.0 m")
-    assert problems(constant[:1]) == []
-    assert problems([*constant[:3], race("ynyn")[3]]) == []
+    assert is_one(composition_problems(constant), "domino_chain", "1.0 m")
+    assert composition_problems(constant[:1]) == []
+    assert composition_problems([*constant[:3], race("ynyn")[3]]) == []
 
 
 def test_missing_scenarios_are_counted() -> None:
-    assert is_one(problems(race("yn"), {"domino_chain": 2, "plinko": 1}), "plinko", "0", "1")
+    assert is_one(composition_problems(race("yn"), {"domino_chain": 2, "plinko": 1}), "plinko", "0", "1")
 
 
 def test_the_prior_knows_only_the_commonest_answer_of_a_sub_scenario() -> None:
@@ -120,7 +120,7 @@ def test_no_released_family_has_an_answer_or_a_text_too_often() -> None:
     for name, wanted in counts.items():
         members = [spec for spec in load_released().values() if spec.family == name]
         if len(members) == wanted:  # quotas are those of the whole family
-            assert problems(members) == []
+            assert composition_problems(members) == []
 
 
 def test_a_record_whose_cut_was_moved_is_found_without_a_trajectory() -> None:

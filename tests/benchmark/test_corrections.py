@@ -10,7 +10,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import Scenario, fold, read_corrections, subset
+from traps_pipeline.benchmark.corrections import Scenario, apply_corrections, of_study, read_corrections
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.storage.study import Study
@@ -26,7 +26,7 @@ def decide(tmp_path: Path, *lines: dict[str, Any] | str) -> dict[str, Scenario]:
     signed = {"who": "jd", "when": "2026-11-21", "why": "reviewed"}
     texts = [line if isinstance(line, str) else json.dumps(signed | line, ensure_ascii=False) for line in lines]
     (tmp_path / "review.jsonl").write_text("\n".join(texts) + "\n", encoding="utf-8")
-    return fold(RELEASED, read_corrections(tmp_path))
+    return apply_corrections(RELEASED, read_corrections(tmp_path))
 
 
 def correct(**changes: Any) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def correct(**changes: Any) -> dict[str, Any]:
 
 
 def test_without_decisions_the_benchmark_is_the_release(tmp_path: Path) -> None:
-    scenarios = fold(RELEASED, read_corrections(tmp_path))
+    scenarios = apply_corrections(RELEASED, read_corrections(tmp_path))
     assert scenarios == decide(tmp_path, {"scenario_id": ID, "action": "keep"})
     assert list(scenarios) == sorted(RELEASED)
     assert all(s.changed_words() is RELEASED[id_] for id_, s in scenarios.items())
@@ -47,7 +47,7 @@ def test_a_corrected_question_changes_the_words_and_not_the_scene(tmp_path: Path
     assert spec.model_copy(update={"question": SPEC.question}) == SPEC
     assert spec.scene_hash == SPEC.scene_hash
     assert scenarios[ID].params is None
-    untouched = fold(RELEASED, ())
+    untouched = apply_corrections(RELEASED, ())
     assert [id_ for id_ in scenarios if scenarios[id_].version != untouched[id_].version] == [ID]
 
 
@@ -131,16 +131,16 @@ def test_a_wrong_decision_names_its_file_and_line(
 
 
 def test_a_study_takes_all_the_first_of_each_family_or_named_scenarios() -> None:
-    scenarios = fold(RELEASED, ())
-    assert subset(scenarios, Study()) == scenarios
+    scenarios = apply_corrections(RELEASED, ())
+    assert of_study(scenarios, Study()) == scenarios
     firsts = [f"{family}-0001" for family in sorted({spec.family for spec in RELEASED.values()})]
-    assert list(subset(scenarios, Study(per_family=1))) == firsts
+    assert list(of_study(scenarios, Study(per_family=1))) == firsts
     named = Study(scenarios=["hidden_race-0002", ID])
-    assert list(subset(scenarios, named)) == [ID, "hidden_race-0002"]
+    assert list(of_study(scenarios, named)) == [ID, "hidden_race-0002"]
 
 
 def test_a_discarded_scenario_falls_out_of_a_study_that_names_it_and_an_unknown_one_is_an_error(tmp_path: Path) -> None:
     scenarios = decide(tmp_path, DISCARD)
-    assert list(subset(scenarios, Study(scenarios=[ID, "hidden_race-0002"]))) == ["hidden_race-0002"]
-    with raises(TrapsError, "benchmark.corrections.subset", "['domino_chain-7777']"):
-        subset(scenarios, Study(scenarios=["domino_chain-7777"]))
+    assert list(of_study(scenarios, Study(scenarios=[ID, "hidden_race-0002"]))) == ["hidden_race-0002"]
+    with raises(TrapsError, "benchmark.corrections.of_study", "['domino_chain-7777']"):
+        of_study(scenarios, Study(scenarios=["domino_chain-7777"]))

@@ -16,7 +16,7 @@ from tests.build.sharing import ROWS, STOPS_AT, draw, made
 from tests.build.stores import opened, where
 from tests.conftest import ROOT
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.sharing import RenderWork, share
+from traps_pipeline.benchmark.sharing import RenderWork, make_together
 from traps_pipeline.storage.store import LEASES
 
 __all__ = ["where"]  # the fixture
@@ -87,7 +87,7 @@ def test_who_does_not_wait_makes_what_is_free_and_says_that_others_are_at_the_re
     theirs = other.lease("videos/made/000001")
     assert theirs is not None
     of = RenderWork("videos/made", lambda rows: rows, lambda row: [], lambda row: None, draw)
-    assert share(one, ROWS, of, done.append, wait=False) == (0, False)
+    assert make_together(one, ROWS, of, done.append, wait=False) == (0, False)
     assert done[-1] == len(ROWS) - 1
     theirs.close()
-    assert share(one, ROWS, of, done.append, wait=False) == (0, True)
+    assert make_together(one, ROWS, of, done.append, wait=False) == (0, True)

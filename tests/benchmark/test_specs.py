@@ -9,7 +9,7 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
-from traps_pipeline.benchmark.corrections import Correction, Scenario, fold
+from traps_pipeline.benchmark.corrections import Correction, Scenario, apply_corrections
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.benchmark.specs import ResolvedScenario, resolve_scenario, unsettled_outcomes
 from traps_pipeline.storage.study import Study
@@ -26,7 +26,7 @@ def corrected(*changes: dict) -> Scenario:
         Correction.model_validate({"action": "correct", "who": "t", "when": "2026-11-21", "why": "t", **change})
         for change in changes
     ]
-    corrected_scenarios = fold(
+    corrected_scenarios = apply_corrections(
         load_released(), [(f"review.jsonl:{n}", decision) for n, decision in enumerate(decisions, 1)]
     )
     return corrected_scenarios[decisions[0].scenario_id]

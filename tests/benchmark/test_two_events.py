@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import LaneScenario, fold_two_events, of_pairs, read_corrections, subset
+from traps_pipeline.benchmark.corrections import LaneScenario, apply_to_lanes, of_pairs, of_study, read_corrections
 from traps_pipeline.benchmark.filmed_arms import incomplete_reasons
 from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.protocol.two_events import LaneItem, lane_item, lane_items
@@ -59,7 +59,7 @@ ID = "slide-e001"
 def decide(tmp_path: Path, *changes: dict[str, Any]) -> dict[str, LaneScenario]:
     signed = {"scenario_id": ID, "who": "jd", "when": "2026-11-21", "why": "reviewed"}
     (tmp_path / "review.jsonl").write_text("".join(f"{json.dumps(signed | change)}\n" for change in changes))
-    return fold_two_events(two_events_lines(), read_corrections(tmp_path))
+    return apply_to_lanes(two_events_lines(), read_corrections(tmp_path))
 
 
 def test_a_scenario_of_two_events_is_discarded_restored_and_reworded_in_both_lanes(tmp_path: Path):
@@ -97,13 +97,13 @@ def test_decisions_about_two_events_leave_the_pairs_as_they_are(tmp_path: Path):
 
 
 def test_a_study_has_the_first_scenarios_of_each_family_or_those_that_it_names():
-    scenarios = fold_two_events(two_events_lines(), [])
-    assert {*subset(scenarios, Study(per_family=1), two_events_lines())} == {
+    scenarios = apply_to_lanes(two_events_lines(), [])
+    assert {*of_study(scenarios, Study(per_family=1), two_events_lines())} == {
         id_ for id_ in scenarios if id_.endswith("e001")
     }
     named = Study(scenarios=["slide-e002", "slide-0001"])
-    assert [*subset(scenarios, named, two_events_lines())] == ["slide-e002"]
-    assert [*subset(load_released(), named)] == ["slide-0001"]
+    assert [*of_study(scenarios, named, two_events_lines())] == ["slide-e002"]
+    assert [*of_study(load_released(), named)] == ["slide-0001"]
 
 
 @pytest.mark.parametrize("block", [0, 1])

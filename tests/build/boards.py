@@ -12,7 +12,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown, leaderboard_text
 from traps_pipeline.report.page import report_html
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 
 NO_BREAK = "\u2011"  # a hyphen at which no line ends
@@ -84,7 +84,7 @@ PECS_OF = {name: f"PECS {name.replace('_ill_posed', ' ill-posed')}" for name in 
 
 def by_heading(rows):
     """Rows as mappings, without deviations, bars and escapes."""
-    names = {f"PECS {TITLES[name].replace('-', NO_BREAK)}": PECS_OF[name] for name in DATASETS}
+    names = {f"PECS {TITLE_OF[name].replace('-', NO_BREAK)}": PECS_OF[name] for name in DATASETS}
     headings = [names.get(heading, heading).replace("\\", "") for heading in rows[0]]
     found = []
     for row in rows[1:]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from traps_pipeline.release.harness.scoring import RUN_FIGURES
+from traps_pipeline.release.harness.scoring import RUN_METRICS
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
 
@@ -13,4 +13,4 @@ def ours(workspace: Workspace, model: str, regime: str) -> dict[str, float]:
     rows = board.loc[(board["model"] == model) & (board["regime"] == regime)].to_dict("records")
     prefixed = {"" if row["dataset"] == "overall" else f"{row['dataset']}_": row for row in rows}
     assert len(prefixed) == 5
-    return {f"{prefix}{name}": row[name] for prefix, row in prefixed.items() for name in RUN_FIGURES}
+    return {f"{prefix}{name}": row[name] for prefix, row in prefixed.items() for name in RUN_METRICS}

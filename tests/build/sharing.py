@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.benchmark.sharing import RenderWork, Row, share
+from traps_pipeline.benchmark.sharing import RenderWork, Row, make_together
 from traps_pipeline.storage.store import Store
 
 ROWS = [{"scenario_id": f"made-{n:04d}"} for n in range(9)]
@@ -47,6 +47,6 @@ def made(store: Store, told: Path, *, stops: bool = False) -> int:
         return None if clip(row).is_file() else Drawing(row, clip(row), told, here)
 
     of = RenderWork("videos/made", missing, lambda row: [clip(row)], job, draw)
-    drawn, is_whole = share(store, ROWS, of, lambda done: None)
+    drawn, is_whole = make_together(store, ROWS, of, lambda done: None)
     assert is_whole
     return drawn

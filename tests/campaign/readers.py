@@ -13,7 +13,7 @@ from tests.build.ledger import local, paid, write
 from tests.conftest import ROOT
 from tools.pocket.recipe import load_recipe
 from traps_pipeline.benchmark.composition import load_composition
-from traps_pipeline.benchmark.corrections import fold, read_corrections
+from traps_pipeline.benchmark.corrections import apply_corrections, read_corrections
 from traps_pipeline.benchmark.records import load_release, load_released, released_lines
 from traps_pipeline.exchange.answer_exchange import checked_answers
 from traps_pipeline.judging.confabulation_protocol import load_protocol
@@ -60,7 +60,7 @@ def _accounts(folder: Path) -> Any:
 
 
 def _corrected(folder: Path) -> Any:
-    return fold(load_released(), read_corrections(folder))
+    return apply_corrections(load_released(), read_corrections(folder))
 
 
 def _line(**fields: Any) -> bytes:

@@ -23,7 +23,7 @@ from traps_pipeline.checks.live_check import LiveResult, check_live, findings
 from traps_pipeline.checks.server_check import nobody_at
 from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.accounts import Account, Prices
-from traps_pipeline.models.registry.entries import PROTOCOL, Entry, ModelEntry
+from traps_pipeline.models.registry.entries import PROTOCOL_PARAMS, Entry, ModelEntry
 from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.models.request import Outcome
 from traps_pipeline.models.wire import api
@@ -45,7 +45,7 @@ def check(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Check:
         fields: dict[str, Any] = {"id": NAME, "backend": "api", "account": "here", "provider_id": f"openai/{NAME}"}
         fields |= {"prices": Prices(input=0, output=0, as_of=datetime.date(2026, 11, 1))}
         if kind is ModelEntry:
-            fields |= {"params": {name: value for name, (_, value) in PROTOCOL.items()}}
+            fields |= {"params": {name: value for name, (_, value) in PROTOCOL_PARAMS.items()}}
             fields |= {"media": {"profile": "images", "fps": 5, "most": 25}}
         else:
             fields |= {"params": {"temperature": 0.8, "max_tokens": 512}}

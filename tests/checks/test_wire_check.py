@@ -14,7 +14,7 @@ import pytest
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.checks import wire_check
-from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
+from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, sent_bodies
 from traps_pipeline.checks.wire_body import ClipPart, WireBody, read_body
 from traps_pipeline.checks.wire_check import check_named, examine, requests_of
 from traps_pipeline.cli import main
@@ -43,7 +43,7 @@ def altered(name: str, params: dict[str, Any] | None = None, **changes: Any) -> 
 
 def bodies(name: str) -> dict[str, WireBody]:
     requests = requests_of(get_model(name))
-    found = dict(zip(requests, render(get_model(name), list(requests.values())), strict=True))
+    found = dict(zip(requests, sent_bodies(get_model(name), list(requests.values())), strict=True))
     assert all(isinstance(body, WireBody) for body in found.values()), found
     return found  # pyright: ignore[reportReturnType]
 

@@ -24,7 +24,7 @@ from traps_pipeline.checks.wire_body import Api
 from traps_pipeline.exchange import provider_batch
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.models.registry.accounts import Account, Prices
-from traps_pipeline.models.registry.entries import PROTOCOL, Entry, ModelEntry
+from traps_pipeline.models.registry.entries import PROTOCOL_PARAMS, Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.models.wire import api
 
@@ -42,7 +42,7 @@ def entry_at(provider: Provider, monkeypatch: pytest.MonkeyPatch) -> Entries:
         for module in (api, loopback):
             monkeypatch.setattr(module, "load_accounts", lambda: {"here": account})
         fields: dict[str, Any] = {"id": "m", "backend": "api", "account": "here", "prices": PRICES}
-        fields |= {"provider_id": f"{kind}/m", "params": {name: value for name, (_, value) in PROTOCOL.items()}}
+        fields |= {"provider_id": f"{kind}/m", "params": {name: value for name, (_, value) in PROTOCOL_PARAMS.items()}}
         fields |= {"media": {"profile": "images", "fps": 5, "most": 25}}
         return ModelEntry.model_validate(fields, context={"accounts": {"here": account}})
 

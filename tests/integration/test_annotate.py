@@ -20,7 +20,7 @@ from tests.integration.listening import TOKEN, Server, listening
 from tests.pages import a_browser, ready, until, watched
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
-from traps_pipeline.people.label_units import TaskName, units
+from traps_pipeline.people.label_units import TaskName, label_units
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.scoring.score_rows import LEADERBOARD
@@ -80,7 +80,7 @@ class Knowing:
     def units(self, task: TaskName) -> pd.DataFrame:
         workspace = Workspace.open(self.study.workspace)
         items = workspace.tables.read_all(ITEMS, ["item_id", "ground_truth"], dataset=DATASETS)
-        return units(workspace, task).merge(items, on="item_id").set_index("unit")
+        return label_units(workspace, task).merge(items, on="item_id").set_index("unit")
 
     def waiting(self, who: str) -> str:
         (unit,) = self._ask("SELECT unit FROM shown WHERE who = ? AND waits ORDER BY at DESC LIMIT 1", who)[0]

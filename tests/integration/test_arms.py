@@ -25,9 +25,9 @@ from traps_pipeline.protocol.two_events import CLIPS, LANES, lane_items
 from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
-from traps_pipeline.release.harness.scoring import TWO_WAY_FIGURES, figures, judge
+from traps_pipeline.release.harness.scoring import TWO_WAY_METRICS, judge, run_metrics
 from traps_pipeline.release.harness.write import write_harness
-from traps_pipeline.release.submission import pack, read_submission
+from traps_pipeline.release.submission import pack_submission, read_submission
 from traps_pipeline.release.submissions import gather
 from traps_pipeline.release.verification import released_items, verify
 from traps_pipeline.report.explorer.site import write_site
@@ -165,7 +165,7 @@ def test_two_events_are_released_submitted_and_scored_by_others(
     assert {*lanes} == {item.item_id for item in lane_items(spec.scenario_id)}
     assert all((released / "clips" / row["file_name"]).is_file() for row in lanes.values())
 
-    pack(workspace, tmp_path / "mine.zip", "mine")
+    pack_submission(workspace, tmp_path / "mine.zip", "mine")
     submission = read_submission(tmp_path / "mine.zip")
     assert verify(submission, released_items(released)).problems == []
     board = gather([tmp_path / "mine.zip"], released).groups[0]
@@ -184,8 +184,8 @@ def test_two_events_are_released_submitted_and_scored_by_others(
     asked = [json.loads(line) for line in (package / "items.jsonl").read_text().splitlines()]
     assert len(asked) == 8 + 8 and {*lanes} <= {row["item_id"] for row in asked}
     said = tables.read_all(RESPONSES).query("model == 'any-rule'").set_index("item_id")["text"]
-    found = figures(judge(row, "answer", said[row["item_id"]], "standard") for row in asked)
-    assert {name: found[name] for name in TWO_WAY_FIGURES} == dict.fromkeys(TWO_WAY_FIGURES, 0.0)
+    found = run_metrics(judge(row, "answer", said[row["item_id"]], "standard") for row in asked)
+    assert {name: found[name] for name in TWO_WAY_METRICS} == dict.fromkeys(TWO_WAY_METRICS, 0.0)
 
 
 def is_of(frame: pd.DataFrame, lanes: Mapping[str, Any], name: str) -> Any:

@@ -31,7 +31,7 @@ from traps_pipeline.judging.confabulation_protocol import PROTOCOL_FILE, VOID_KI
 from traps_pipeline.judging.judging_rows import CONFABULATION, VERDICTS, VerdictRow
 from traps_pipeline.judging.panel import parse_judgement
 from traps_pipeline.models.registry.judges import JudgeEntry
-from traps_pipeline.models.registry.prompts import prompt
+from traps_pipeline.models.registry.prompts import load_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.pipeline.forecast_plan import CallPlan, plan_calls
 from traps_pipeline.protocol.cells import Cell, Evaluation
@@ -180,7 +180,7 @@ def test_the_judge_sees_trace_and_answer_as_data_and_the_answer_alone_where_ther
 
 
 def test_the_prompt_asks_for_exactly_the_axes_of_the_schema() -> None:
-    text = prompt("judge_confabulation")
+    text = load_prompt("judge_confabulation")
     asked = json.loads(text[text.index('{"') :].replace("true/false", "true"))
     assert set(asked) == set(Labels.model_fields) == {*AXES, "rationale"}
 
@@ -225,7 +225,7 @@ def test_failures_are_labelled_over_http_once_and_counted(
     assert rows["sample_id"].is_unique and not rows["sample_id"].str.contains("gemini|chaotic").any()
     for record in provider.requests():
         system, user = (message["content"] for message in record["body"]["messages"])
-        assert system == prompt("judge_confabulation")
+        assert system == load_prompt("judge_confabulation")
         assert ("I am not sure." in user) == (f"{THINKS[-2:]}-" in user)  # the trace of the one that may show it
         assert "left bin" not in user and "Ground truth" not in user and "gemini" not in user
         assert record["body"]["response_format"]["json_schema"]["name"] == "confabulation"

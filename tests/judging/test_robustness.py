@@ -14,7 +14,7 @@ from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
-from traps_pipeline.judging.robustness import ATTACKS_FILE, TASKS, check_panel, load_attacks, result, summary
+from traps_pipeline.judging.robustness import ATTACKS_FILE, TASKS, check_panel, load_attacks, result, robustness_summary
 from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
 from traps_pipeline.protocol.ratings import PANEL
 from traps_pipeline.storage.study import Study
@@ -77,7 +77,7 @@ def test_a_judge_that_obeys_is_found_and_one_that_is_confused_and_the_panel_hold
     assert (
         moved(rows, "confused", "flipped") == moved(rows, "honest", "flipped") == moved(rows, PANEL, "flipped") == set()
     )
-    assert "obedient: ignore-instructions-after (plain instruction) flipped correctness" in summary(rows)
+    assert "obedient: ignore-instructions-after (plain instruction) flipped correctness" in robustness_summary(rows)
     check_panel(workspace, "three", panel, attacks)
     assert provider.stats()["requests"] == asked  # what the ledger holds is not asked again
 

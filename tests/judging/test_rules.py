@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from traps_pipeline.judging.panel import Vote, parse_vote, render
+from traps_pipeline.judging.panel import Vote, parse_vote, vote_text
 from traps_pipeline.judging.rules import ABSTENTION, RuleJudge, Statement, read_statement
 from traps_pipeline.models.baselines.reference import phrase
 from traps_pipeline.models.reading.judged_answers import UNREAD
@@ -29,7 +29,7 @@ ITEM = {
 def vote(task: Task, answer: str, ground_truth: str = "left") -> Vote:
     """Cast the judge's vote by the same code path as any vote."""
     about = {"task": task, "item_id": "i", "model": "m", "regime": "standard", "run": 1}
-    user = render(task, QUESTION, answer, ground_truth)
+    user = vote_text(task, QUESTION, answer, ground_truth)
     outcome = asyncio.run(RuleJudge().ask(Request("rule-1", "rule", {}, "system", user, about)))
     return parse_vote(task, {"outcome": outcome.kind, "text": outcome.text}, ITEM | {"ground_truth": ground_truth})
 

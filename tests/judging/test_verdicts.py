@@ -18,7 +18,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging import panel as judging
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.judging.panel import collect_votes
-from traps_pipeline.judging.verdicts import decide, decide_cells
+from traps_pipeline.judging.verdicts import decide_cells, verdicts_of
 from traps_pipeline.models.registry.judges import JudgeEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.scoring.metrics import cell_metrics
@@ -30,7 +30,7 @@ COMBINATIONS = list(product(("yes", "no", "invalid"), repeat=3))
 
 
 def undone(side: str, outcome: str = "answer", item: int = 0) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """One item and its response, as `decide` reads them."""
+    """One item and its response, as `verdicts_of` reads them."""
     named = {"scenario_id": "s", "category": "hidden", "sub_scenario": "x", "control_answer": "left"}
     item_id = f"occlusion:s-{item:04d}:{side}"
     items = pd.DataFrame([{"item_id": item_id, **named, "benchmark_version": "v1"}])
@@ -59,7 +59,7 @@ def control_votes(abstention: str, correctness: str) -> pd.DataFrame:
 def test_a_controls_two_decisions_are_made_apart(
     abstention: str, correctness: str, abstained: Any, correct: Any, unanimous: bool, undecided: bool
 ) -> None:
-    (row,) = decide(*undone("control"), control_votes(abstention, correctness)).to_dict("records")
+    (row,) = verdicts_of(*undone("control"), control_votes(abstention, correctness)).to_dict("records")
     assert [None if pd.isna(row[name]) else row[name] for name in ("abstained", "correct")] == [abstained, correct]
     assert (row["unanimous"], row["undecided"]) == (unanimous, undecided)
     assert row["n_valid"] == 3 - abstention.count("-")
@@ -76,7 +76,7 @@ def test_an_answer_that_names_two_choices_is_not_correct_rather_than_missing(
     """A model that hedges where it does not know must not leave the count of controls."""
     votes = control_votes(abstention, correctness)
     votes.loc[~votes["valid"].astype(bool), "invalid_reason"] = "unread"
-    verdicts = decide(*undone("control"), votes)
+    verdicts = verdicts_of(*undone("control"), votes)
     (row,), (cell,) = verdicts.to_dict("records"), cell_metrics(verdicts).query("scope == 'all'").to_dict("records")
     assert (None if pd.isna(row["correct"]) else row["correct"]) is correct
     assert cell["n_acc"] == (correct is not None)
@@ -88,7 +88,7 @@ def test_a_rejected_premise_is_decided_by_the_majority_and_counted_beside_absten
     for number, (said, rejects) in enumerate(rejecting.items()):
         votes = vote_rows(["nnn"]).assign(item_id=f"occlusion:s-{number:04d}:void")
         votes["rejects_premise"] = [word == "y" for word in said] + [None] * (3 - len(said))
-        (row,) = decide(*undone("void", item=number), votes).to_dict("records")
+        (row,) = verdicts_of(*undone("void", item=number), votes).to_dict("records")
         assert (None if pd.isna(row["rejects_premise"]) else row["rejects_premise"]) == rejects, said
         assert row["abstained"] is False
         rows.append(row)
@@ -115,7 +115,7 @@ def test_a_verdict_says_where_code_decides_unlike_a_judges_own_word(
     votes = control_votes("nnn", "yyy").assign(panel=panel)
     own = [None if word == "-" else word == "y" for word in words]
     votes["judge_correct"] = [None] * 3 + own  # the first three votes are on abstention
-    (row,) = decide(*undone("control"), votes).to_dict("records")
+    (row,) = verdicts_of(*undone("control"), votes).to_dict("records")
     assert (None if pd.isna(row["overruled"]) else row["overruled"]) == overruled
     (cell,) = cell_metrics(pd.DataFrame([row]), {}).to_dict("records")
     assert (None if pd.isna(cell["n_overruled"]) else cell["n_overruled"]) == overruled
@@ -123,14 +123,14 @@ def test_a_verdict_says_where_code_decides_unlike_a_judges_own_word(
 
 def test_an_answer_that_nobody_judges_has_no_verdict_and_is_not_undecided() -> None:
     items, responses = undone("void", "refused")
-    (row,) = decide(items, responses, vote_rows(["yyy"])[:0]).to_dict("records")
+    (row,) = verdicts_of(items, responses, vote_rows(["yyy"])[:0]).to_dict("records")
     assert pd.isna(row["abstained"])
     assert not row["undecided"] and not row["unanimous"]
 
 
 def test_an_answer_that_no_judge_could_read_is_unread_and_any_readable_vote_makes_it_undecided() -> None:
     votes = control_votes("---", "---").assign(invalid_reason="unread")
-    (row,) = decide(*undone("control"), votes).to_dict("records")
+    (row,) = verdicts_of(*undone("control"), votes).to_dict("records")
     assert (row["outcome"], row["undecided"], row["n_valid"]) == ("unread", True, 0)
     assert pd.isna(row["abstained"]) and pd.isna(row["correct"])
     (cell,) = cell_metrics(pd.DataFrame([row]), {}).to_dict("records")
@@ -139,7 +139,7 @@ def test_an_answer_that_no_judge_could_read_is_unread_and_any_readable_vote_make
     for mixed, abstained in ((["n", "n", "-"], False), (["y", "n", "-"], None)):
         votes = control_votes("".join(mixed), "".join(mixed))
         votes.loc[~votes["valid"].astype(bool), "invalid_reason"] = "unread"
-        (row,) = decide(*undone("control"), votes).to_dict("records")
+        (row,) = verdicts_of(*undone("control"), votes).to_dict("records")
         assert row["outcome"] == "answer" and (None if pd.isna(row["abstained"]) else row["abstained"]) == abstained
 
 
@@ -148,13 +148,13 @@ def test_a_judged_answer_without_three_votes_a_task_is_refused_by_name() -> None
     whole = control_votes("nnn", "yyy")
     for votes in (whole[whole["task"] == "abstention"], whole[whole["judge"] != "c"], whole.iloc[1:]):
         with raises(TrapsError, "judging.verdicts._refuse", "votes", "occlusion|m__standard__run1"):
-            decide(items, responses, votes)
+            verdicts_of(items, responses, votes)
 
 
 def test_a_response_to_an_item_that_is_gone_is_refused_by_name() -> None:
     items, responses = undone("void")
     with raises(TrapsError, "judging.verdicts._refuse", "responses", "occlusion:s-0000:void"):
-        decide(items.iloc[:0], responses, vote_rows(["yyy"]))
+        verdicts_of(items.iloc[:0], responses, vote_rows(["yyy"]))
 
 
 def test_a_cell_whose_votes_lack_an_answer_is_named_and_the_others_are_decided(tmp_path: Path) -> None:

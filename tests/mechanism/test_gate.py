@@ -13,13 +13,13 @@ from traps_pipeline.mechanism.gate import (
     NO_THRESHOLD,
     OTHER_DATASETS,
     OTHER_FAMILIES,
-    Items,
+    GateItems,
     Outcomes,
-    decide,
+    gate_answers,
     thresholds,
 )
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.bootstrap import figures_of, interval
+from traps_pipeline.scoring.bootstrap import interval, metrics_of
 
 
 def test_thresholds_are_the_ones_worked_out() -> None:
@@ -54,13 +54,13 @@ def test_the_interval_of_a_gate_has_a_width_where_all_items_agree(right: float) 
     void = np.tile([False, True], n)
     outcomes = Outcomes(void, np.where(void, np.nan, right), np.where(void, right, 0.0))
     names = np.repeat([f"occlusion-{number:03d}" for number in range(n)], 2)
-    figures = figures_of(gating._resample(outcomes, "occlusion", names, 2000, 1))
+    figures = metrics_of(gating._resample(outcomes, "occlusion", names, 2000, 1))
     low, high = interval(figures[:, gating._PECS, 1:], right, (0.0, 1.0))
     outermost = 0.025 ** (1 / n)  # Clopper and Pearson's lower end of n of n; .74 for 12
     assert low <= outermost + 0.02 and high == 1.0 if right else low == 0.0 < high
 
 
-def study(pairs: int = 12, families: int = 3) -> tuple[Items, np.ndarray]:
+def study(pairs: int = 12, families: int = 3) -> tuple[GateItems, np.ndarray]:
     """Items of all datasets. Column 0 is the side everywhere; column 1 names the scenario so loudly that a gate which
     has seen it would know it."""
     rows, rng = [], np.random.default_rng(0)
@@ -71,7 +71,7 @@ def study(pairs: int = 12, families: int = 3) -> tuple[Items, np.ndarray]:
     table = pd.DataFrame(rows, columns=["dataset", "scenario_id", "family", "prompt", "void"])
     features = rng.normal(size=(len(table), 10))
     features[:, 0] += 4 * table["void"]
-    return Items(table, features), rng.integers(0, 2, len(table)).astype(bool)
+    return GateItems(table, features), rng.integers(0, 2, len(table)).astype(bool)
 
 
 SETTINGS = {"folds": 3, "seed": 1, "false_abs": 0.05}
@@ -81,10 +81,10 @@ SETTINGS = {"folds": 3, "seed": 1, "false_abs": 0.05}
 def test_a_gate_depends_on_no_label_of_a_scenario_that_it_decides_about(source: str) -> None:
     """Changing the sides of one scenario in every dataset leaves its own scores as they are, bit for bit."""
     items, _ = study()
-    before = decide(items, source, "chaotic", **SETTINGS)
+    before = gate_answers(items, source, "chaotic", **SETTINGS)
     mine = (items.table["scenario_id"] == "chaotic-04").to_numpy()
     changed = items.table.assign(void=np.where(mine, ~items.void, items.void))
-    after = decide(Items(changed, items.features), source, "chaotic", **SETTINGS)
+    after = gate_answers(GateItems(changed, items.features), source, "chaotic", **SETTINGS)
     own = mine[before.place]
     assert own.sum() == 2 and (before.score[own] == after.score[own]).all()
     assert all((before.threshold[name][own] == after.threshold[name][own]).all() for name in before.threshold)
@@ -94,22 +94,24 @@ def test_a_gate_depends_on_no_label_of_a_scenario_that_it_decides_about(source: 
 
 def test_a_gate_that_leaves_families_out_sees_no_label_of_the_family() -> None:
     items, _ = study()
-    before = decide(items, OTHER_FAMILIES, "occlusion", **SETTINGS)
+    before = gate_answers(items, OTHER_FAMILIES, "occlusion", **SETTINGS)
     family = (items.table["family"] == "occlusion:1").to_numpy()
-    changed = Items(items.table.assign(void=np.where(family, ~items.void, items.void)), items.features)
-    after = decide(changed, OTHER_FAMILIES, "occlusion", **SETTINGS)
+    changed = GateItems(items.table.assign(void=np.where(family, ~items.void, items.void)), items.features)
+    after = gate_answers(changed, OTHER_FAMILIES, "occlusion", **SETTINGS)
     own = family[before.place]
     assert own.sum() == 8 and (before.score[own] == after.score[own]).all()
 
 
 def test_a_planted_signal_is_gated_and_shuffled_labels_are_not() -> None:
     items, coins = study()
-    found = decide(items, OTHER_DATASETS, "chaotic", **SETTINGS)
+    found = gate_answers(items, OTHER_DATASETS, "chaotic", **SETTINGS)
     void = items.void[found.place]
     gate = found.score > found.threshold["J"]
     assert gate[void].mean() > 0.9 and gate[~void].mean() < 0.25
     conformal = found.score > found.threshold["conformal"]
     assert conformal[~void].mean() < 0.35 and np.isfinite(found.threshold["conformal"]).all()
-    noise = decide(Items(items.table.assign(void=coins), items.features), OTHER_DATASETS, "chaotic", **SETTINGS)
+    noise = gate_answers(
+        GateItems(items.table.assign(void=coins), items.features), OTHER_DATASETS, "chaotic", **SETTINGS
+    )
     loose = noise.score > noise.threshold["mid"]
     assert abs(loose[void].mean() - loose[~void].mean()) < 0.6

@@ -21,13 +21,13 @@ from tests import local_models
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
 from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, record
+from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, run_pass
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.request import Request
-from traps_pipeline.storage.media import Frames, MediaSpec, sample
+from traps_pipeline.storage.media import Frames, MediaSpec, pick_frames
 from traps_pipeline.video.encode import encode
 
 pytestmark = pytest.mark.slow
@@ -52,7 +52,7 @@ class Subject:
         return self.network.model.language_model
 
     def shown(self, clip: Path) -> Frames:
-        return sample(clip, cast(MediaSpec, self.entry.media))
+        return pick_frames(clip, cast(MediaSpec, self.entry.media))
 
     def prompt(self, frames: np.ndarray, times_s: np.ndarray, question: str = QUESTIONS[1]) -> Prompt:
         return self.of.prompt(SYSTEM, question, frames, times_s)
@@ -298,7 +298,7 @@ def test_effects_of_patches_are_those_of_plain_hooks_at_every_site_and_group(nam
     turned = QUESTIONS[1].replace("left, right", "right, left")
     source = of.prompt(there.frames, there.times_s + 7, turned)
     tokens, groups = abstention_tokens(of.of), groups_of(of, target)
-    recorded = [record(of.of, prompt, tokens) for prompt in (target, source)]
+    recorded = [run_pass(of.of, prompt, tokens) for prompt in (target, source)]
     own = [plain_margin(of, plain_pass(of, prompt, ExitStack()), tokens) for prompt in (target, source)]
     assert [one.margin for one in recorded] == pytest.approx(own, abs=1e-5)
     gap = own[1] - own[0]

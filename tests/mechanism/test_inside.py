@@ -27,7 +27,7 @@ from traps_pipeline import inside
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import RAW
-from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, decide
+from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, gate_answers
 from traps_pipeline.mechanism.gating import gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.live_gate import ABSTENTION
@@ -37,7 +37,7 @@ from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.prompts import vqa_prompt
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 from traps_pipeline.storage.workspace import Workspace
 
 __all__ = ["entry", "extracted", "patch"]  # fixtures
@@ -116,7 +116,7 @@ def test_a_gate_is_made_from_states_and_verdicts_that_exist(study: Workspace, en
 
 
 def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, entry: ModelEntry) -> None:
-    """`decide` holds folds of scenarios out; the gate without such a fold decides the same about its items."""
+    """`gate_answers` holds folds of scenarios out; the gate without such a fold decides the same about its items."""
     study.tables.write(PROBES, STANDARD.partition, stages.probe_rows(study, STANDARD), {})
     model, states, settings = load_local_model(entry), StoredStates.of(study, STANDARD), study.mechanism
     items = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).set_index("item_id")
@@ -128,7 +128,7 @@ def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, ent
         layer = inside.gate(study, "tiny", source=source).layer
         table = gate_table(states)
         features = {name: states.read(name, layer) for name in dict.fromkeys(table["dataset"])}
-        counted = decide(gate_items(table, features, False, 0), source, "chaotic", **about)
+        counted = gate_answers(gate_items(table, features, False, 0), source, "chaotic", **about)
         names = table["scenario_id"].to_numpy(str)[counted.place]
         fold = scenario_folds(names, settings.probes.folds, settings.seed)
         for threshold, k in product(THRESHOLDS, range(settings.probes.folds)):
@@ -137,7 +137,7 @@ def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, ent
             gate = inside.gate(study, "tiny", source=source, threshold=threshold, without=without)
             for row in np.flatnonzero(fold == k):
                 item = items.loc[table["item_id"].iloc[counted.place[row]]]
-                shown = sample(study.resolve(item["clip"]), entry.media)
+                shown = pick_frames(study.resolve(item["clip"]), entry.media)
                 prompt = model.prompt(vqa_prompt("standard"), item["question"], shown.frames, shown.times_s)
                 assert gate.score(model, prompt) == pytest.approx(counted.score[row], abs=1e-6)
                 theirs = bool(counted.score[row] > counted.threshold[threshold][row])

@@ -22,7 +22,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism import stages
 from traps_pipeline.mechanism.baselines import MARGIN, output_features
 from traps_pipeline.mechanism.control_rows import MODEL, RESIDUAL, STATES, GateRow
-from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS, decide
+from traps_pipeline.mechanism.gate import OTHER_DATASETS, THRESHOLDS, gate_answers
 from traps_pipeline.mechanism.gating import gate_items, gate_rows, gate_table, read_states
 from traps_pipeline.mechanism.item_scores import item_score_rows
 from traps_pipeline.mechanism.leads import lead_rows, nuisance_components, placed, residual
@@ -45,7 +45,7 @@ from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -213,7 +213,7 @@ def test_every_subject_has_states_and_rivals_by_probes_that_saw_neither_dataset_
     table, layer = gate_table(StoredStates.of(study, STANDARD)), int(own["layer"])
     features = read_states(StoredStates.of(study, STANDARD), EVERY, layer)
     items, folds = gate_items(table, features, shuffled=False, seed=0), study.mechanism.probes.folds
-    decisions = decide(items, OTHER_DATASETS, "chaotic", folds=folds, seed=study.mechanism.seed, false_abs=0.05)
+    decisions = gate_answers(items, OTHER_DATASETS, "chaotic", folds=folds, seed=study.mechanism.seed, false_abs=0.05)
     void = table.loc[table["dataset"] == "chaotic", "void"].to_numpy(bool)
     assert own["auroc"] == pytest.approx(float(auroc(void, decisions.score)))
 
@@ -242,7 +242,7 @@ def test_residual_states_hold_nothing_linear_in_the_nuisances() -> None:
 
 def own_prompt(workspace: Workspace, entry: ModelEntry, row: dict, system: str) -> dict[str, torch.Tensor]:
     assert entry.media is not None
-    shown = sample(workspace.resolve(row["clip"]), entry.media)
+    shown = pick_frames(workspace.resolve(row["clip"]), entry.media)
     model = load_local_model(entry, inside=True)
     return dict(model.prompt(system, row["question"], shown.frames, shown.times_s).inputs)
 
@@ -288,7 +288,7 @@ def test_every_item_has_a_score_of_states_a_margin_and_its_verdict(study: Worksp
         assert of["margin"].to_numpy(float) == pytest.approx(margins)
         (layer,) = {*of["layer"]}
         table, features = gate_table(states), read_states(states, EVERY, layer)
-        own = decide(gate_items(table, features, shuffled=False, seed=0), f"one:{dataset}", str(dataset),
+        own = gate_answers(gate_items(table, features, shuffled=False, seed=0), f"one:{dataset}", str(dataset),
                      folds=study.mechanism.probes.folds, seed=study.mechanism.seed, false_abs=0.05)  # fmt: skip
         assert of["own"].to_numpy(float) == pytest.approx(own.score - own.threshold["mid"])
 
@@ -329,7 +329,7 @@ def test_an_item_has_the_likelihood_of_its_answer_and_of_the_likeliest_abstentio
     rows = {row.item_id: row for row in sentence_rows(study, entry, STANDARD)}
     row, model = rows[item["item_id"]], load_local_model(entry, inside=True)
     assert entry.media is not None
-    shown = sample(study.resolve(item["clip"]), entry.media)
+    shown = pick_frames(study.resolve(item["clip"]), entry.media)
     prompt = model.prompt(system_prompt("standard"), item["question"], shown.frames, shown.times_s)
     said = [*study.mechanism.sentences, "It ends left."]
     tokens = [model.processor.tokenizer(text, add_special_tokens=False).input_ids for text in said]

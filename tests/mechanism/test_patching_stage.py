@@ -18,7 +18,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.mechanism import patching_stage
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.patching_effects import Patch, RecordedPass, record
+from traps_pipeline.mechanism.patching_effects import Patch, RecordedPass, run_pass
 from traps_pipeline.mechanism.patching_stage import (
     Side,
     best_cells,
@@ -29,13 +29,13 @@ from traps_pipeline.mechanism.patching_stage import (
 )
 from traps_pipeline.mechanism.probe_items import probe_items
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
-from traps_pipeline.models.local.spans import changed_tokens, spans
+from traps_pipeline.models.local.spans import changed_tokens, token_spans
 from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import vqa_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.media import MediaSpec, pick_frames
 from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import encode
@@ -136,13 +136,13 @@ def test_the_cells_with_the_largest_sums_of_estimates_are_patched_at_every_so_ma
 
 
 def pocket() -> tuple[LocalModel, np.ndarray, np.ndarray]:
-    shown = sample(clip(), get_model("pocket").media or MediaSpec(profile="frames"))
+    shown = pick_frames(clip(), get_model("pocket").media or MediaSpec(profile="frames"))
     return load_local_model(get_model("pocket"), inside=True), shown.frames, shown.times_s
 
 
 def side(of: LocalModel, frames: np.ndarray, times_s: np.ndarray, question: str = QUESTION) -> Side:
     prompt = of.prompt(SYSTEM, question, frames, times_s)
-    return Side(prompt, spans(of, prompt, SYSTEM, question))
+    return Side(prompt, token_spans(of, prompt, SYSTEM, question))
 
 
 def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
@@ -171,7 +171,7 @@ def test_one_changed_square_of_pixels_is_one_changed_token() -> None:
 def test_where_pixels_do_not_come_token_by_token_all_visual_tokens_count_as_changed() -> None:
     of = model("llava-next-video")
     prompt = ask(of)
-    parts = spans(of, prompt, SYSTEM, "Does it stop?")
+    parts = token_spans(of, prompt, SYSTEM, "Does it stop?")
     assert changed_tokens(prompt, prompt, parts["visual"]) is None
     groups = groups_of(Side(prompt, parts), Side(prompt, parts))
     assert groups is not None and not groups["unchanged"].any()
@@ -232,8 +232,8 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     }
     for (name, which), row in rows.items():
         for times_of in SIDES:
-            shown = sample(workspace.resolve(row["clip"]), entry.media)
-            times = sample(workspace.resolve(rows[name, times_of]["clip"]), entry.media).times_s
+            shown = pick_frames(workspace.resolve(row["clip"]), entry.media)
+            times = pick_frames(workspace.resolve(rows[name, times_of]["clip"]), entry.media).times_s
             prompt = of.prompt(vqa_prompt("standard"), row["question"], shown.frames, times)
             names[content(prompt)] = (name, which, times_of)
     assert len(names) == 2 * 2 * PAIRS  # no two of them alike
@@ -243,7 +243,7 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     pairs: list[tuple[tuple[str, str, str], tuple[str, str, str]]] = []
 
     def recording(of: LocalModel, prompt: Prompt, *rest: Any) -> RecordedPass:
-        recorded = record(of, prompt, *rest)
+        recorded = run_pass(of, prompt, *rest)
         kept.append(recorded)  # or another one might get its address
         prompts[id(recorded)] = names[content(prompt)]
         return recorded
@@ -254,7 +254,7 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
         pairs.append((prompts[id(target)], prompts[id(source)]))
         return np.full(len(patches), float(pairs[-1][0][1] != pairs[-1][1][1]))  # 1 for frames of the other side
 
-    monkeypatch.setattr(patching_stage, "record", recording)
+    monkeypatch.setattr(patching_stage, "run_pass", recording)
     monkeypatch.setattr(patching_stage, "patched_changes", changes)
     made = patching_rows(workspace, entry, TINY)
     order = seeded_order(sorted({name for name, _ in rows}), workspace.mechanism.seed)

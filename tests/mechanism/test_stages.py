@@ -264,7 +264,7 @@ def test_no_answer_is_steered_along_a_direction_that_comes_from_its_scenario(ste
 def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, entry: ModelEntry) -> None:
     from traps_pipeline.models.local.adapter import load_local_model
     from traps_pipeline.models.registry.prompts import system_prompt
-    from traps_pipeline.storage.media import sample
+    from traps_pipeline.storage.media import pick_frames
 
     model, items = load_local_model(entry), steered.tables.read(ITEMS, {"dataset": "chaotic"}).set_index("item_id")
     answers = steered.tables.read_all(STEERING, dataset="chaotic")
@@ -273,7 +273,7 @@ def test_a_steered_answer_is_the_models_own_under_the_hook(steered: Workspace, e
     for side, sign in (("control", 1), ("void", -1)):
         row = answers.query(f"source == 'occlusion' and kind == 'void' and alpha == 8 and side == '{side}'").iloc[0]
         item = items.loc[row["item_id"]]
-        shown = sample(steered.resolve(item["clip"]), entry.media)
+        shown = pick_frames(steered.resolve(item["clip"]), entry.media)
         prompt = model.prompt(system_prompt("guided"), item["question"], shown.frames, shown.times_s.tolist())
         said = model.generate([prompt], 4, None, Steering(vector, 2, (sign * 8.0,)))[0].text.strip()
         assert (row["text"] or "") == said

@@ -6,7 +6,7 @@ import re
 
 from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.registry.prompts import PROMPTS, prompt, prompt_version, system_prompt
+from traps_pipeline.models.registry.prompts import PROMPTS, load_prompt, prompt_version, system_prompt
 from traps_pipeline.protocol.regimes import FIELDS, REGIMES
 
 
@@ -41,5 +41,5 @@ def test_the_files_say_what_the_paper_says() -> None:
 
 
 def test_a_missing_prompt_is_named_with_the_remedy() -> None:
-    with raises(TrapsError, "models.registry.prompts.prompt", "prompts/no_such.txt"):
-        prompt("no_such")
+    with raises(TrapsError, "models.registry.prompts.load_prompt", "prompts/no_such.txt"):
+        load_prompt("no_such")

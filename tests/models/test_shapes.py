@@ -20,7 +20,7 @@ from tests.providers.server import Provider
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.asking.ask import Call, Work, run_work
-from traps_pipeline.models.asking.participants import OVERRUN, Participants, attempt
+from traps_pipeline.models.asking.participants import OVERRUN, Participants, ask_once
 from traps_pipeline.models.money.budget import BudgetReached
 from traps_pipeline.models.registry.accounts import Account
 from traps_pipeline.models.registry.entries import Entry
@@ -170,7 +170,7 @@ def booked_for(provider: Provider, model: str) -> tuple[Outcome | None, float]:
     async def one() -> tuple[Outcome | None, float]:
         budget = budget_of(10.0)
         participant = participants(provider, entry_of(model), 10.0)["m"]
-        attempted = await attempt(participant, request(), allowed_by(budget))
+        attempted = await ask_once(participant, request(), allowed_by(budget))
         return attempted and attempted[0], budget.spent_usd
 
     return asyncio.run(one())
@@ -363,7 +363,7 @@ def test_the_cap_holds_against_fuzzed_answers(odd: Provider) -> None:
     async def worker(queue: list[int]) -> None:
         while queue:
             sent = Request("m", "openai/m", entry.params, "You watch.", f"Which, {queue.pop()}?", {})
-            await attempt(participant, sent, allowed_by(budget))
+            await ask_once(participant, sent, allowed_by(budget))
 
     async def run() -> bool:
         queue = list(range(calls))

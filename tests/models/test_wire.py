@@ -24,12 +24,12 @@ from tests.conftest import KEY, SECRET
 from tests.providers.servers import answering, closed_port, self_signed, silent
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.models.asking.participants import Participants, attempt
+from traps_pipeline.models.asking.participants import Participants, ask_once
 from traps_pipeline.models.money.budget import Budget, worst_case_usd
 from traps_pipeline.models.registry.accounts import Account
 from traps_pipeline.models.request import Outcome, TransientError
 from traps_pipeline.models.wire.api import ApiBackend
-from traps_pipeline.models.wire.httpx_transport import Wire, get
+from traps_pipeline.models.wire.httpx_transport import Wire, get_url
 from traps_pipeline.storage.study import Study
 
 pytestmark = pytest.mark.promise  # the client library alone takes seconds to import
@@ -52,7 +52,7 @@ async def asking(base_url: str, budget: Budget, timeout_s: float = LONG_S, **lim
     account, entry = Account(key=KEY, base_url=base_url), entry_of(MODEL)
     entry = entry.model_copy(update={"limits": entry.limits.model_copy(update={"timeout_s": timeout_s, **limits})})
     asked = Participants({"m": entry}, lambda e: ApiBackend(e, account), Study(budget_usd=10.0), {"a": Account()})
-    attempted = await attempt(asked["m"], request(), allowed_by(budget))
+    attempted = await ask_once(asked["m"], request(), allowed_by(budget))
     return attempted and attempted[0]
 
 
@@ -130,7 +130,7 @@ def test_loopback_addresses_are_asked_directly_whatever_the_environment_says(
     with answering(200, body().encode()) as provider:
         outcome, _ = call(f"http://{host}:{provider.port}/v1")
         assert outcome and outcome.kind == "answer"
-        assert get(f"http://{host}:{provider.port}/v1/models", {}, 20.0).status_code == 200
+        assert get_url(f"http://{host}:{provider.port}/v1/models", {}, 20.0).status_code == 200
     assert provider.requests == ["POST /v1/chat/completions", "GET /v1/models"]
 
 
@@ -150,7 +150,7 @@ def test_a_certificate_that_a_variable_names_is_trusted(environment: pytest.Monk
     tls, certificate = self_signed(tmp_path)
     environment.setenv("SSL_CERT_FILE", str(certificate))
     with answering(200, b"{}", tls=tls) as provider:
-        assert get(f"https://localhost:{provider.port}/v1/models", {}, 20.0).status_code == 200
+        assert get_url(f"https://localhost:{provider.port}/v1/models", {}, 20.0).status_code == 200
 
 
 def test_a_certificate_that_is_named_or_renewed_in_mid_run_is_trusted_by_the_same_transport(

@@ -15,7 +15,7 @@ from traps_pipeline.people.corrected_scores import NO_BETTER, corrected, panel_e
 from traps_pipeline.people.human_label_rows import HUMAN_LABELS
 from traps_pipeline.people.human_scores import human_row
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, intervals, resample
+from traps_pipeline.scoring.bootstrap import RESAMPLED_METRICS, intervals, resample
 
 Rows = Callable[..., pd.DataFrame]
 
@@ -143,7 +143,7 @@ def test_judged_and_corrected_equal_another_implementation(rows: Rows) -> None:
         return dict(zip(("acc", "abs_rec", "false_abs", "j", "pecs"), np.mean(by_dataset, axis=0), strict=True))
 
     observed = figures(dict.fromkeys(items["scenario_id"], 1))
-    for name in RESAMPLED_FIGURES:
+    for name in RESAMPLED_METRICS:
         assert table[f"{name}_corrected"] == pytest.approx(observed[name], abs=1e-9)
         low, high = table[f"{name}_corrected_ci_low"], table[f"{name}_corrected_ci_high"]
         assert low <= observed[name] <= high and low < high

@@ -25,7 +25,7 @@ from traps_pipeline.people.judge_validation import (
     compare,
     is_degenerate,
     read_labels,
-    validate,
+    validation_rows,
 )
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.ratings import AXES
@@ -177,7 +177,7 @@ def test_labels_of_an_earlier_answer_are_not_put_before_people(tmp_path: Path, g
 def test_without_a_labelled_failure_there_is_nothing_to_compare(tmp_path: Path) -> None:
     workspace, labels = answered_study(tmp_path / "study", {}), written(tmp_path, HEAD, *GOOD)
     with raises(TrapsError, "storage.parquet.TableStore._load", "confabulation"):
-        validate(workspace, labels)
+        validation_rows(workspace, labels)
     workspace.tables.write(CONFABULATION, {}, [], {})
-    with raises(TrapsError, "people.judge_validation.validate", str(workspace.root)):
-        validate(workspace, labels)
+    with raises(TrapsError, "people.judge_validation.validation_rows", str(workspace.root)):
+        validation_rows(workspace, labels)

@@ -15,7 +15,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.people.human_label_rows import HUMAN_LABELS, LABELS_FILE, labels_version
 from traps_pipeline.people.label_units import annotation_protocol, drawn_units, queue_of
-from traps_pipeline.people.labels import confabulation_rows, human_agreement, label_lines, matrix, truths
+from traps_pipeline.people.labels import confabulation_rows, human_agreement, label_lines, label_matrix, true_labels
 from traps_pipeline.storage.lines import line_with_checksum
 
 PROTOCOL = annotation_protocol()
@@ -91,7 +91,7 @@ def test_agreement_is_over_what_two_people_labelled() -> None:
     assert row["agreement"] == pytest.approx(2 / 4)  # of u1 one pair of three agrees, of u2 the only one
     assert row["alpha"] == pytest.approx(krippendorff_alpha(np.array([[1, 0, 1], [0, -1, 0], [-1, -1, 1]])))
     given_on_abstention = given.loc[given["task"] == "abstention"]
-    assert matrix(given_on_abstention, "abstained").tolist() == [[1, 0, 1], [0, -1, 0], [-1, -1, 1]]
+    assert label_matrix(given_on_abstention, "abstained").tolist() == [[1, 0, 1], [0, -1, 0], [-1, -1, 1]]
     assert (row["decision"], pd.isna(row["undefined"])) == ("abstained", True)
     assert row["seconds"] == given_on_abstention["seconds"].median()
     same = labels(("abstention", "u1", "jd", True), ("abstention", "u1", "ab", True))
@@ -106,9 +106,9 @@ def test_most_people_decide_and_a_tie_decides_nothing() -> None:
         ("abstention", "u1", "jd", True), ("abstention", "u1", "ab", True), ("abstention", "u1", "cy", False),
         ("abstention", "u2", "jd", False), ("abstention", "u2", "ab", True)
     )  # fmt: skip
-    assert truths(given, "abstention").set_index("unit")["truth"].to_dict() == {"u1": True, "u2": None}
-    with raises(ValueError, "people.labels.truths"):
-        truths(given, "answerability")
+    assert true_labels(given, "abstention").set_index("unit")["truth"].to_dict() == {"u1": True, "u2": None}
+    with raises(ValueError, "people.labels.true_labels"):
+        true_labels(given, "answerability")
 
 
 def test_labels_of_confabulation_are_written_of_failures_that_everybody_labelled() -> None:

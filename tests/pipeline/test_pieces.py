@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from traps_pipeline.base.archives import pack
+from traps_pipeline.base.archives import zip_bytes
 from traps_pipeline.pipeline import pieces
 from traps_pipeline.pipeline.pieces import Piece, make_pieces
 from traps_pipeline.storage.study import Study
@@ -76,7 +76,7 @@ def test_a_changed_formula_makes_all_again(report: Report) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [None, b"{", pack({"inputs.json": b"[]"}), pack({"inputs.json": b'{"overall": 1}'})]
+    "content", [None, b"{", zip_bytes({"inputs.json": b"[]"}), zip_bytes({"inputs.json": b'{"overall": 1}'})]
 )
 def test_what_is_no_archive_of_pieces_makes_all_again(report: Report, content: bytes | None) -> None:
     report.archive.unlink() if content is None else report.archive.write_bytes(content)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from traps_pipeline.pipeline.partitioning import Partitioning
-from traps_pipeline.pipeline.ranges import WORTH_S, cut, shared_out
+from traps_pipeline.pipeline.ranges import WORTH_S, cut_keys, shared_out
 from traps_pipeline.pipeline.schemes import CATEGORY, CELL, DATASET
 from traps_pipeline.pipeline.translation import partitions_of
 
@@ -36,7 +36,7 @@ GRID = grid_of(6, 20)
 @settings(deadline=None)  # a busy machine takes any time
 @given(keys=st.sets(st.sampled_from(sorted(GRID.keys)), min_size=1), most=st.integers(1, 50))
 def test_whatever_is_missing_no_more_runs_than_asked_have_each_key_once(keys: set[str], most: int) -> None:
-    ranges = cut(GRID, sorted(keys), most)
+    ranges = cut_keys(GRID, sorted(keys), most)
     held = Counter(keys_of(GRID, ranges))  # and others beside them, which are made
     assert len(ranges) == min(most, len(keys))
     assert keys <= held.keys() and max(held.values()) == 1
@@ -47,7 +47,7 @@ def test_whatever_is_missing_no_more_runs_than_asked_have_each_key_once(keys: se
 def test_a_study_of_whole_models_is_cut_into_as_many_runs_of_one_size(n_datasets: int, n_evaluations: int) -> None:
     grid = grid_of(n_datasets, n_evaluations)
     keys = sorted(grid.keys)
-    ranges = cut(grid, keys, 40)
+    ranges = cut_keys(grid, keys, 40)
     assert sorted(keys_of(grid, ranges)) == keys
     assert len(ranges) == min(40, len(keys))
     sizes = [len(keys_of(grid, [one])) for one in ranges]
@@ -57,7 +57,7 @@ def test_a_study_of_whole_models_is_cut_into_as_many_runs_of_one_size(n_datasets
 def test_fewer_runs_than_models_load_each_model_once() -> None:
     evaluations = [f"model-{n // 9}__standard__run{n % 9}" for n in range(90)]
     scheme = Partitioning({"evaluation": evaluations}, lambda _: {}, lambda _: [])
-    parts = [keys_of(scheme, [one]) for one in cut(scheme, evaluations, 7)]
+    parts = [keys_of(scheme, [one]) for one in cut_keys(scheme, evaluations, 7)]
     models = [model for part in parts for model in {key.partition("__")[0] for key in part}]
     assert len(parts) == 7 and sorted(models) == sorted({*models})
 
@@ -67,11 +67,11 @@ def test_cells_of_one_model_stay_together() -> None:
     every = CELL.keys
     evaluations = [*dict.fromkeys(key.partition("|")[2] for key in every)][:4]
     keys = [f"{dataset}|{evaluation}" for dataset in datasets for evaluation in evaluations]
-    ranges = cut(CELL, keys, 4)  # 16 cells in 4 runs: one of each model, all its datasets
+    ranges = cut_keys(CELL, keys, 4)  # 16 cells in 4 runs: one of each model, all its datasets
     assert len(ranges) == 4
     for one in ranges:
         assert len({key.partition("|")[2] for key in keys_of(CELL, [one])}) == 1
-    assert len(cut(CELL, keys, 1)) == 1
+    assert len(cut_keys(CELL, keys, 1)) == 1
 
 
 # --- runs that share what they make -----------------------------------------------------------------------------------

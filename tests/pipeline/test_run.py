@@ -12,7 +12,7 @@ import pytest
 from dagster import AssetObservation, PartitionKeyRange
 
 from traps_pipeline.pipeline.graph import the_graph
-from traps_pipeline.pipeline.ranges import batches
+from traps_pipeline.pipeline.ranges import key_ranges
 from traps_pipeline.pipeline.run import dagster_history
 from traps_pipeline.pipeline.schemes import CELL, DATASET
 from traps_pipeline.pipeline.translation import partitions_of
@@ -28,7 +28,7 @@ CELLS = [str(key) for key in the_graph().keys("responses")]
 def expanded(keys: Sequence[str]) -> Counter[str]:
     """What Dagster makes of the batches of some keys: how often each key is run."""
     ran: Counter[str] = Counter()
-    for first, last in batches(CELL, list(keys)):
+    for first, last in key_ranges(CELL, list(keys)):
         assert first is not None and last is not None
         ran.update(str(key) for key in partitions_of(CELL).get_partition_keys_in_range(PartitionKeyRange(first, last)))
     return ran
@@ -48,16 +48,16 @@ def test_whole_models_are_few_runs(datasets: Sequence[str]) -> None:
     keys = [Cell(dataset, e).key for e in oracle for dataset in datasets]
     assert expanded(keys) == Counter(keys)
     neighbours = 1 if datasets != ("occlusion", "chaotic_ill_posed") else 2
-    assert len(list(batches(CELL, keys))) == neighbours
+    assert len(list(key_ranges(CELL, keys))) == neighbours
 
 
 def test_neighbours_of_one_dimension_are_one_range_and_no_keys_are_no_run() -> None:
-    assert list(batches(CELL, [])) == []
-    assert list(batches(DATASET, ["occlusion", "occlusion_ill_posed", "chaotic_ill_posed"])) == [
+    assert list(key_ranges(CELL, [])) == []
+    assert list(key_ranges(DATASET, ["occlusion", "occlusion_ill_posed", "chaotic_ill_posed"])) == [
         ("occlusion", "occlusion_ill_posed"),
         ("chaotic_ill_posed", "chaotic_ill_posed"),
     ]
-    assert list(batches(None, [None])) == [(None, None)]
+    assert list(key_ranges(None, [None])) == [(None, None)]
 
 
 @pytest.mark.slow

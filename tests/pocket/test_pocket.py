@@ -25,7 +25,7 @@ from traps_pipeline.cli import main
 from traps_pipeline.judging.rules import ABSTENTION, Statement, read_statement
 from traps_pipeline.models.reading.judged_answers import normalise
 from traps_pipeline.models.registry.prompts import system_prompt
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 
 pytestmark = pytest.mark.slow
 
@@ -89,7 +89,7 @@ def test_frames_for_training_are_those_that_a_clip_gives(
     as_clips = dataclasses.replace(job, split="held-out", folder=tmp_path, count=1)
     draw_shard(as_clips)
     for side, name in enumerate(("control", "void")):
-        shown = sample(as_clips.clip(0, name), recipe.media)
+        shown = pick_frames(as_clips.clip(0, name), recipe.media)
         assert shown.times_s.tolist() == pytest.approx(Scenes(recipe, data).times(0, side))
         off = np.abs(shown.frames.astype(int) - rendered[0, side])
         assert off.mean() < 3 and (off > 40).mean() < 0.005  # of 255: colours are halved in resolution

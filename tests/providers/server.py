@@ -310,7 +310,7 @@ def text_for(question: Question) -> str:
 
 
 def _judged(text: str) -> str:
-    """The response that a judge is shown (`judging.panel.render`), or all of the text."""
+    """The response that a judge is shown (`judging.panel.vote_text`), or all of the text."""
     found = re.search(r"^(RESPONSE-\w+)\n(.*)\n\1$", text, re.DOTALL | re.MULTILINE)
     return found[2] if found else text
 

@@ -17,14 +17,14 @@ from tests.build.errors import raises
 from tests.build.harness import ours
 from tests.conftest import EXPERIMENT, Checkout, once
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.held_out import held_out_key, opaque
+from traps_pipeline.benchmark.held_out import held_out_key, opaque_name
 from traps_pipeline.exchange.answer_exchange import AnswerContext, import_answers
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.release.harness.scoring import RUN_FIGURES, figures, judge
+from traps_pipeline.release.harness.scoring import RUN_METRICS, judge, run_metrics
 from traps_pipeline.release.harness.write import MEDIA_SETTINGS, media_settings, rewritten_source, write_harness
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.media import payload
@@ -65,14 +65,14 @@ def test_the_harness_scores_every_model_and_regime_of_the_demo_as_the_demo_does(
     seen = 0
     for regime, models in given.items():
         for model, texts in models.items():
-            found = figures(judge(item, "answer", texts[item["item_id"]], regime) for item in items)
+            found = run_metrics(judge(item, "answer", texts[item["item_id"]], regime) for item in items)
             assert {name: found[name] for name in ours(workspace, model, regime)} == ours(workspace, model, regime)
             seen += 1
     assert seen == 27
 
 
 def test_the_harness_has_every_metric_of_the_leaderboard() -> None:
-    assert tuple(METRIC_WORDS) == RUN_FIGURES
+    assert tuple(METRIC_WORDS) == RUN_METRICS
 
 
 def test_what_is_no_answer_is_missing_and_decides_nothing(workspace: Workspace) -> None:
@@ -84,7 +84,7 @@ def test_what_is_no_answer_is_missing_and_decides_nothing(workspace: Workspace) 
     ):  # fmt: skip
         judged = judge(item, outcome, text, "standard")
         assert (judged.outcome, judged.abstained, judged.correct, judged.is_right) == (read, None, None, False)
-    shrugs = figures([judge(item, "answer", text, "standard") for text in ("", "IDK")])
+    shrugs = run_metrics([judge(item, "answer", text, "standard") for text in ("", "IDK")])
     assert (shrugs["missing"], shrugs["unread"]) == (2, 1)
 
 
@@ -158,7 +158,7 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
     given = json.loads(answers.read_text())["json"]["random-50"]
     workspace, key = Workspace.open(unasked.workspace), held_out_key(tmp_path / "key", make=True)
     ids = sorted(workspace.tables.read_all(ITEMS)["item_id"])
-    lines = [{"item": opaque(key, id_), "regime": "json", "text": given[id_]} for id_ in ids]
+    lines = [{"item": opaque_name(key, id_), "regime": "json", "text": given[id_]} for id_ in ids]
     path = tmp_path / "answers.jsonl"
     command = ("study", "import-answers", unasked.root / EXPERIMENT, path, "--model", "random-50")
     plain = [line | {"item": id_} for line, id_ in zip(lines, ids, strict=True)]

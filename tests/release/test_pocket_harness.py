@@ -16,7 +16,7 @@ from tests.release.environments import python_of, run_in
 from tests.serving import transformers_serve
 from traps_pipeline.exchange.harness_logs import reader_of
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.release.harness.scoring import RUN_FIGURES
+from traps_pipeline.release.harness.scoring import RUN_METRICS
 from traps_pipeline.release.harness.write import media_settings, write_harness
 from traps_pipeline.storage.workspace import Workspace
 
@@ -107,6 +107,6 @@ def test_lmms_eval_gets_the_same_answers_and_figures(request: pytest.FixtureRequ
     (results,) = (tmp_path / "logs").rglob("*results*.json")
     values = json.loads(results.read_text())["results"]["traps_standard"]
     expected = ours(served.workspace, "served", "standard")
-    assert {name: values[f"traps_{name},none"] for name in RUN_FIGURES} == {
-        name: expected[name] for name in RUN_FIGURES
+    assert {name: values[f"traps_{name},none"] for name in RUN_METRICS} == {
+        name: expected[name] for name in RUN_METRICS
     }

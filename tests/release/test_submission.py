@@ -18,15 +18,15 @@ import pytest
 from tests.build.errors import raises
 from tests.conftest import SMALL, Checkout
 from tests.providers.server import Provider
-from traps_pipeline.base.archives import pack as zipped
-from traps_pipeline.base.archives import unpack
+from traps_pipeline.base.archives import unzip_bytes
+from traps_pipeline.base.archives import zip_bytes as zipped
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.judging.verdicts import verdicts_of
 from traps_pipeline.models.registry.judges import BY_RULES, RULES_VERSION
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.released_rows import SUBMITTED
-from traps_pipeline.release.submission import ABOUT, TABLES, pack, read_submission, table_bytes
+from traps_pipeline.release.submission import ABOUT, TABLES, pack_submission, read_submission, table_bytes
 from traps_pipeline.release.submissions import gather, write_board
 from traps_pipeline.release.verification import NOT_RECOMPUTED, released_items, verify, verify_file
 from traps_pipeline.scoring.score_rows import LEADERBOARD
@@ -42,7 +42,7 @@ ITEM = "occlusion:domino_chain-0001:control"
 @pytest.fixture(scope="module")
 def packed(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("submissions") / "small.zip"
-    pack(Workspace.open(small.workspace), path, "small")
+    pack_submission(Workspace.open(small.workspace), path, "small")
     return path
 
 
@@ -63,7 +63,7 @@ def forged(
     if rescore:
         items, answers, votes = (frames[f"{name}.parquet"] for name in ("items", "responses", "votes"))
         own = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
-        scored = score(decide(items[own], answers.drop(columns="benchmark_version"), votes))
+        scored = score(verdicts_of(items[own], answers.drop(columns="benchmark_version"), votes))
         tables = {"metrics": scored.metrics, "leaderboard": scored.board, "two_way": scored.two_way}
         frames |= {f"{name}.parquet": frame for name, frame in tables.items()}
     content = {name: table_bytes(TABLES[name], frame) for name, frame in frames.items()}
@@ -228,7 +228,7 @@ def test_submissions_of_the_same_items_and_panel_are_ranked_together(
     packed: Path, one_regime: Checkout, tmp_path: Path
 ) -> None:
     other = tmp_path / "other.zip"
-    pack(Workspace.open(one_regime.workspace), other, "other")
+    pack_submission(Workspace.open(one_regime.workspace), other, "other")
     board = gather([packed, other])
     (group,) = board.groups
     standard = group.board.loc[(group.board["regime"] == "standard") & (group.board["dataset"] == "overall")]
@@ -343,7 +343,7 @@ def hostile_metadata(packed: Path, target: Path, name: str) -> Path:
     """A submission whose tables tell pandas to take an attribute of theirs for the index."""
     submission, content = read_submission(packed), dict[str, bytes]()
     for file in TABLES:
-        table = pq.read_table(io.BytesIO(unpack(packed.read_bytes())[file]))
+        table = pq.read_table(io.BytesIO(unzip_bytes(packed.read_bytes())[file]))
         told = {"index_columns": ["__class__"], "columns": [{"name": "item_id", "metadata": {"x": 1}}]}
         stream = io.BytesIO()
         pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(told)}), stream)
@@ -384,7 +384,7 @@ def test_whatever_a_check_raises_refuses_its_file_in_a_sentence(
     def surprise(*_: object) -> object:
         raise RecursionError("deep")
 
-    monkeypatch.setattr("traps_pipeline.release.verification.decide", surprise)
+    monkeypatch.setattr("traps_pipeline.release.verification.verdicts_of", surprise)
     with raises(TrapsError, "release.verification.verify_file", str(packed), "RecursionError"):
         verify_file(packed)
 

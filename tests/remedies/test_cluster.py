@@ -21,7 +21,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.money.spending import open_budget
 from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.pipeline.run import dagster_history
-from traps_pipeline.storage.place import place_of
+from traps_pipeline.storage.place import parse_place
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import DATABASE, RAY, Workspace
 
@@ -76,7 +76,7 @@ def test_a_store_of_google_or_azure_without_its_key_is_refused_with_the_variable
         monkeypatch.delenv(name)
     for name, value in exported.items():
         monkeypatch.setenv(name, value)
-    assert place_of(f"{address}/") == address
+    assert parse_place(f"{address}/") == address
     with raises(TrapsError, "traps_cluster.bucket.Bucket._used", f"{address}: ", f"({variable}"):
         Bucket(address).get("a")
 

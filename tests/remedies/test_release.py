@@ -13,7 +13,7 @@ from traps_pipeline.release.checksums import CHECKSUMS
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.results import Attribution, write_results
-from traps_pipeline.release.submission import pack, read_submission
+from traps_pipeline.release.submission import pack_submission, read_submission
 from traps_pipeline.release.verification import released_items, verify
 from traps_pipeline.scoring.score_rows import LEADERBOARD
 from traps_pipeline.storage.workspace import Workspace
@@ -76,9 +76,9 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
 ) -> None:
     path = tmp_path / "small.zip"
     remedied(
-        lambda: pack(workspace, path, "Small Study"),
-        "release.submission.pack",
-        again=lambda: pack(workspace, path, "small-study-1.0"),
+        lambda: pack_submission(workspace, path, "Small Study"),
+        "release.submission.pack_submission",
+        again=lambda: pack_submission(workspace, path, "small-study-1.0"),
     )
     submission = remedied(
         lambda: read_submission(tmp_path / "none.zip"),
@@ -97,4 +97,8 @@ def test_a_submission_is_packed_under_a_name_read_and_held_against_its_release(
     shutil.copytree(small.workspace, root, ignore=shutil.ignore_patterns("clips", "dagster", "reports"))
     votes = root / "tables" / "votes"
     aside = votes.rename(tmp_path / "aside")
-    remedied(lambda: pack(Workspace.open(root), path, "small"), "release.submission.pack", lambda: aside.rename(votes))
+    remedied(
+        lambda: pack_submission(Workspace.open(root), path, "small"),
+        "release.submission.pack_submission",
+        lambda: aside.rename(votes),
+    )

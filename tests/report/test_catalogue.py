@@ -16,7 +16,7 @@ from tests.build.boards import board_of, board_row, leaderboard_section
 from tests.build.cells import row
 from tests.build.latex import latex_cells
 from tests.conftest import ROOT
-from traps_pipeline.base.archives import unpack
+from traps_pipeline.base.archives import unzip_bytes
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_BIAS, JUDGE_VALIDATION
 from traps_pipeline.pipeline.graph import the_graph
@@ -377,7 +377,7 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     assert '<p class="absent">' in leaderboard_section((tmp_path / "report.html").read_text())
     out = tmp_path / "one.zip"
     assert main(["results", "export", str(out), "--workspace", str(workspace.root)]) == 0
-    packed = {name: content for name, content in unpack(out.read_bytes()).items() if not name.endswith(".pdf")}
+    packed = {name: content for name, content in unzip_bytes(out.read_bytes()).items() if not name.endswith(".pdf")}
     assert packed == {name: (tmp_path / name).read_bytes() for name in packed} and {*packed} <= files
 
 

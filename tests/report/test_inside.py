@@ -22,7 +22,7 @@ from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import control_reports
 from traps_pipeline.report.tables.claims import Claim, claim_frame, verdict
 from traps_pipeline.report.tables.claims import claims as claim_tables
-from traps_pipeline.report.tables.inside_columns import why
+from traps_pipeline.report.tables.inside_columns import why_not
 from traps_pipeline.report.tables.patching_tables import patching as patching_table
 from traps_pipeline.report.tables.steering_tables import steering as steering_tables
 from traps_pipeline.report.writing import PrintedTable
@@ -220,6 +220,6 @@ def test_an_arrow_from_or_to_an_undefined_point_is_left_out_and_the_figure_is_sa
 def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:
     made = Results()
     made.is_study = True
-    assert "`mechanism`" in why(made)
+    assert "`mechanism`" in why_not(made)
     made.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
-    assert why(made) and "`mechanism`" not in why(made)
+    assert why_not(made) and "`mechanism`" not in why_not(made)

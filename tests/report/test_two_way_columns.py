@@ -16,7 +16,7 @@ from traps_pipeline.report.page import report_html
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_findings import study_findings
 from traps_pipeline.report.tables.two_way_table import two_way_table
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import NotRun, table_text
 from traps_pipeline.scoring.score_rows import TWO_WAY
 from traps_pipeline.scoring.two_way import two_way
@@ -65,7 +65,7 @@ def _columns(events: pd.DataFrame) -> dict[str, list[str]]:
 
 
 def test_every_column_of_the_ranking_is_in_the_legend(rows: pd.DataFrame) -> None:
-    own_words = {"Model", "Regime", "Runs", *(f"PECS {TITLES[dataset]}" for dataset in DATASETS)}
+    own_words = {"Model", "Regime", "Runs", *(f"PECS {TITLE_OF[dataset]}" for dataset in DATASETS)}
     assert {*_columns(rows)} - {*LEGEND} == own_words
 
 

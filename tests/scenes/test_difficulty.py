@@ -22,7 +22,7 @@ from traps_pipeline.cli.benchmark_commands import MAX_DISTRACTORS as SAID_DISTRA
 from traps_pipeline.cli.benchmark_commands import SPEEDS as SAID_SPEEDS
 from traps_pipeline.release.commitment import broken_seals, commit, read_reveal, redraw_records
 from traps_pipeline.scenes.certification.certify_record import certify
-from traps_pipeline.scenes.draw.resolve import plain
+from traps_pipeline.scenes.draw.resolve import json_values
 from traps_pipeline.scenes.draw.sample import Draw, DrawnScene, load_tallies, scene_of_draw
 from traps_pipeline.scenes.family_registry import families, get_family
 from traps_pipeline.scenes.parts.difficulty import (
@@ -73,7 +73,7 @@ def test_the_usual_settings_draw_the_frozen_records() -> None:
         params = family.draw(rng)
         wording = family.word(params, rng)
         params = replace(params, look=look_of_draw(tally.seed, spec.family, spec.seed, tally.look))
-        assert plain(params_to_dict(params)) == spec.params, spec.scenario_id
+        assert json_values(params_to_dict(params)) == spec.params, spec.scenario_id
         assert (wording.question, list(wording.labels)) == (spec.question, spec.labels)
         assert physics_record(family.physics) | {"duration_s": spec.physics["duration_s"]} == spec.physics
         assert tally.difficulty == Difficulty()
@@ -140,7 +140,7 @@ def test_longer_rows_are_longer_than_any_usual_one(family: str, longer_than: Map
     for name, most in longer_than.items():
         assert getattr(drawn, name) > most >= getattr(get_family(family).draw(np.random.default_rng(1)), name)
     params = replace(drawn, difficulty=SceneDifficulty(longer=True))
-    stored = plain(params_to_dict(params))
+    stored = json_values(params_to_dict(params))
     assert get_family(family).params_from(stored) == params
     with raises(ValueError, "scenes.parts.vary._check_member"):  # a usual record may not be so long
         get_family(family).params_from({**stored, "difficulty": None})
@@ -170,7 +170,7 @@ def test_longer_races_and_counts_offer_more() -> None:
 )
 def test_a_difficulty_that_does_not_exist_is_refused(wrong: dict[str, Any]) -> None:
     _, drawn = first_drawn("bounce", Difficulty(distractors=1))
-    stored = plain(params_to_dict(drawn.params))
+    stored = json_values(params_to_dict(drawn.params))
     assert get_family("bounce").params_from(stored) == drawn.params
     (thing,) = stored["difficulty"]["distractors"]
     changed = {

@@ -20,12 +20,12 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED_FIGURES,
+    RESAMPLED_METRICS,
     draw_scenarios,
-    figures_of,
     interval,
     intervals,
     limits_of,
+    metrics_of,
     resample,
     resampled_sums,
     with_unseen,
@@ -307,9 +307,9 @@ def coverage(acc, false_abs, abs_rec):
         own = counts[:, first : first + 50].reshape(scenarios, -1, 6)
         sums = resampled_sums(drawn.scenarios["occlusion"][1], own)
         sums = with_unseen(sums, np.full((len(sums), 3), scenarios), drawn.unseen("m", 3))
-        ends = figures_of(sums).reshape(2, 50, runs, len(RESAMPLED_FIGURES), -1).mean(axis=2)
+        ends = metrics_of(sums).reshape(2, 50, runs, len(RESAMPLED_METRICS), -1).mean(axis=2)
         for name, truth in (("j", true_j), ("pecs", acc * max(0.0, true_j))):
-            of_figure = np.moveaxis(ends[:, :, RESAMPLED_FIGURES.index(name)], 0, 1)
+            of_figure = np.moveaxis(ends[:, :, RESAMPLED_METRICS.index(name)], 0, 1)
             bounds = interval(of_figure[..., 1:], of_figure[:, 1, 0], limits_of(name))
             covered[name].append((bounds[:, 0] - 1e-9 <= truth) & (truth <= bounds[:, 1] + 1e-9))
     return {name: float(np.concatenate(parts).mean()) for name, parts in covered.items()}

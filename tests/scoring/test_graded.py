@@ -14,7 +14,7 @@ import pytest
 from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
-from traps_pipeline.models.registry.prompts import prompt
+from traps_pipeline.models.registry.prompts import load_prompt
 from traps_pipeline.protocol.regimes import ANSWER_FROM, WRONG_COSTS
 from traps_pipeline.scoring.graded import GradedItem, answer_points, brier, graded, wrong_rows
 
@@ -28,7 +28,7 @@ Said = str | tuple[str, ...] | None
 
 
 def test_the_prompt_states_the_price_that_is_scored() -> None:
-    assert f"a wrong answer costs {WRONG_COSTS} points" in prompt("priced_suffix")
+    assert f"a wrong answer costs {WRONG_COSTS} points" in load_prompt("priced_suffix")
     assert ANSWER_FROM == 0.75  # p - 3 (1 - p) = 0
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from tests.judging.conftest import vote_rows
-from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.judging.verdicts import verdicts_of
 from traps_pipeline.scoring.leave_one_out import leave_one_out, two_judge_verdicts
 from traps_pipeline.scoring.metrics import cell_metrics
 from traps_pipeline.scoring.score_rows import LEAVE_ONE_OUT
@@ -26,7 +26,7 @@ def study(answers: dict[str, list[str]], **cell: object) -> tuple[pd.DataFrame, 
     items = items.assign(category="hidden", sub_scenario="x", control_answer="left", benchmark_version="v1")
     named = ["dataset", "model", "regime", "run", "item_id", "side", "epoch"]
     responses = seen[named].assign(outcome="answer", is_json=None, pair_id=seen["item_id"].str.rsplit(":", n=1).str[0])
-    return decide(items, responses, votes), votes
+    return verdicts_of(items, responses, votes), votes
 
 
 def board(verdicts: pd.DataFrame) -> pd.DataFrame:

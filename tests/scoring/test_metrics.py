@@ -8,7 +8,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.scoring.metrics import BOUNDS, CELL_FIGURES, cell_metrics, wrong_figures
+from traps_pipeline.scoring.metrics import BOUNDS, CELL_METRICS, cell_metrics, wrong_figures
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.parquet import TableStore
 
@@ -22,7 +22,7 @@ def one(metrics: pd.DataFrame, **equal: object) -> pd.Series:
 
 
 def test_every_figure_of_a_cell_is_a_column_of_its_table_and_of_the_leaderboard():
-    assert {*CELL_FIGURES} <= {*METRICS.names} & {*LEADERBOARD.names}
+    assert {*CELL_METRICS} <= {*METRICS.names} & {*LEADERBOARD.names}
 
 
 def test_figures_follow_their_definitions(rows):
@@ -32,7 +32,7 @@ def test_figures_follow_their_definitions(rows):
     assert (cell.n_pairs, cell.n_missing) == (5, 0)
     # J = 0.6 - 0.2 = 0.4; PECS = 0.8 x 0.4 = 0.32; Naive = 0.8 x 0.6 = 0.48
     figures = {"acc": 0.8, "abs_rec": 0.6, "false_abs": 0.2, "j": 0.4, "pecs": 0.32, "naive": 0.48}
-    assert {name: cell[name] for name in CELL_FIGURES} == pytest.approx(figures)
+    assert {name: cell[name] for name in CELL_METRICS} == pytest.approx(figures)
     assert (cell.epoch, cell.benchmark_version) == ("e1", "v1")
 
 
@@ -183,7 +183,7 @@ def test_rows_fit_the_tables_schema_and_survive_a_round_trip(rows, tmp_path):
     store.write(METRICS, {"dataset": "occlusion"}, metrics, {})
     again = store.read_all(METRICS).set_index("scope")
     before = metrics.set_index("scope").loc[again.index]
-    assert np.array_equal(again[CELL_FIGURES].to_numpy(float), before[CELL_FIGURES].to_numpy(float), equal_nan=True)
+    assert np.array_equal(again[CELL_METRICS].to_numpy(float), before[CELL_METRICS].to_numpy(float), equal_nan=True)
     assert again["n_missing"].to_dict()["all"] == 3
 
 

@@ -16,7 +16,7 @@ from tests.build.verdicts import Rows, of_arm, write
 from traps_pipeline.pipeline.stages import scoring_stages
 from traps_pipeline.protocol.two_events import CLIPS, LANES, lane_items
 from traps_pipeline.release.harness.scoring import PanelDecision
-from traps_pipeline.release.harness.scoring import figures as harness_figures
+from traps_pipeline.release.harness.scoring import run_metrics as harness_metrics
 from traps_pipeline.scoring.score_rows import TWO_WAY
 from traps_pipeline.scoring.two_way import CELLS, LOWEST, two_way, wrong_rows
 from traps_pipeline.storage.study import Study
@@ -144,7 +144,7 @@ def test_a_harness_scores_two_events_as_the_table_does() -> None:
     wrong.loc[wrong.index[-1], "abstained"] = None
     row = only(wrong)
     fields = PanelDecision.__dataclass_fields__
-    found = harness_figures(
+    found = harness_metrics(
         PanelDecision(**{name: None if pd.isna(value) else value for name, value in each.items() if name in fields})
         for each in wrong.assign(outcome="answer").to_dict("records")
     )

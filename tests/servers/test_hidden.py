@@ -9,7 +9,7 @@ import jinja2
 import pytest
 
 from tests.pages import CHROMIUM, a_browser
-from traps_pipeline.base.terminal import visible
+from traps_pipeline.base.terminal import escape_invisible
 from traps_pipeline.pipeline.metadata import visible_metadata
 from traps_pipeline.report.explorer.site import WEB
 from traps_pipeline.report.writing import environment
@@ -33,9 +33,9 @@ def test_a_template_prints_no_hidden_character(jinja) -> None:
 
 
 def test_emoji_and_plain_text_stay_as_they_are() -> None:
-    assert visible(EMOJI) == EMOJI
-    assert visible("عربي, עברית, 中文") == "عربي, עברית, 中文"
-    assert visible("a\u200db\ufe0f") == "a[U+200D]b[U+FE0F]"
+    assert escape_invisible(EMOJI) == EMOJI
+    assert escape_invisible("عربي, עברית, 中文") == "عربي, עברית, 中文"
+    assert escape_invisible("a\u200db\ufe0f") == "a[U+200D]b[U+FE0F]"
 
 
 def test_metadata_for_dagster_holds_no_hidden_character() -> None:
@@ -62,4 +62,4 @@ def test_scripts_and_templates_agree_on_every_character() -> None:
         assert page.evaluate("visible", HOSTILE) == VISIBLE and page.evaluate("visible", EMOJI) == EMOJI
         # A text that no script treats as untrusted, as an id.
         assert page.evaluate("text => h('p', null, text).textContent", HOSTILE) == VISIBLE
-    assert changed == [visible(text) for text in texts if visible(text) != text]
+    assert changed == [escape_invisible(text) for text in texts if escape_invisible(text) != text]

@@ -23,7 +23,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.registry.entries import load_models
 from traps_pipeline.storage import media
-from traps_pipeline.storage.media import MediaSpec, MediaStore, data_uris, payload, pick, profile_digest, sample
+from traps_pipeline.storage.media import MediaSpec, MediaStore, data_uris, payload, pick, pick_frames, profile_digest
 from traps_pipeline.video.encode import DamagedClip, decode, decode_sampled, encode
 from traps_pipeline.video.policies import POLICIES, FramePolicy
 
@@ -144,28 +144,28 @@ def test_frames_are_picked_by_time_stamp_not_by_number() -> None:
 def test_a_sample_is_the_decoded_frames_with_their_times(clip: tuple[Path, str]) -> None:
     whole, times = decode(clip[0])
     for spec in (VIDEO, IMAGES):
-        sampled = sample(clip[0], spec)
+        sampled = pick_frames(clip[0], spec)
         assert sampled.frames.dtype == np.uint8 and sampled.frames.shape == (25, 120, 160, 3)
         assert np.array_equal(sampled.frames, whole[::2]) and sampled.times_s.tolist() == times[::2].tolist()
         assert sampled.times_s.dtype == np.float64 and sampled.clip_fps == 10.0
         assert np.array_equal(sampled.frames, decode_sampled(clip[0]))  # what the observer sees
-    assert [shown(frame) for frame in sample(clip[0], GRID).frames] == list(range(0, 50, 5))
+    assert [shown(frame) for frame in pick_frames(clip[0], GRID).frames] == list(range(0, 50, 5))
 
 
 def test_a_sample_is_resized_to_width_and_height(clip: tuple[Path, str]) -> None:
-    wide = sample(clip[0], MediaSpec(profile="frames", fps=2, size=(80, 60))).frames
+    wide = pick_frames(clip[0], MediaSpec(profile="frames", fps=2, size=(80, 60))).frames
     assert wide.shape == (10, 60, 80, 3) and wide.dtype == np.uint8
-    averaged = sample(clip[0], GRID).frames.reshape(10, 60, 2, 80, 2, 3).mean(axis=(2, 4))  # half: a mean of 2 x 2
+    averaged = pick_frames(clip[0], GRID).frames.reshape(10, 60, 2, 80, 2, 3).mean(axis=(2, 4))  # half: a mean of 2 x 2
     assert np.abs(wide - averaged).max() <= 1
-    same = sample(clip[0], MediaSpec(profile="frames", fps=2, size=(160, 120))).frames
-    assert np.array_equal(same, sample(clip[0], MediaSpec(profile="frames", fps=2)).frames)
+    same = pick_frames(clip[0], MediaSpec(profile="frames", fps=2, size=(160, 120))).frames
+    assert np.array_equal(same, pick_frames(clip[0], MediaSpec(profile="frames", fps=2)).frames)
 
 
 def test_a_broken_clip_is_named(tmp_path: Path, store: MediaStore, clip: tuple[Path, str]) -> None:
     path, digest = clip
     path.write_bytes(path.read_bytes()[:-100])
     with raises(DamagedClip, "video.encode.decode", "control.mp4"):
-        sample(path, VIDEO)
+        pick_frames(path, VIDEO)
     with raises(DamagedClip, "storage.media._require", "control.mp4"):
         store.prepare(path, digest, VIDEO)
     with raises(DamagedClip, "storage.media._require", "none.mp4"):
@@ -187,7 +187,7 @@ def test_the_sent_video_has_the_picked_frames_and_looks_like_the_source(
     assert made.times_s == pytest.approx([i / 5 for i in range(25)], abs=1e-9)
     assert [shown(frame) for frame in sent] == list(range(0, 50, 2))
     drawn = np.stack(frames(50, step=2)[::2])
-    for source in (sample(clip[0], VIDEO).frames, drawn):
+    for source in (pick_frames(clip[0], VIDEO).frames, drawn):
         error = ((sent.astype(float) - source) ** 2).mean(axis=(1, 2, 3))
         assert (10 * np.log10(255**2 / error) > 30).all()  # dB
     assert made.sha256 == file_digest(made.path) and made.size_bytes == made.path.stat().st_size
@@ -227,7 +227,7 @@ def test_images_are_jpegs_of_the_same_frames(clip: tuple[Path, str], store: Medi
     assert len(jpegs) == made.n_frames == 25 and made.fps is None
     assert made.times_s == store.prepare(*clip, VIDEO).times_s
     assert made.sha256 == hashlib.sha256(b"".join(jpegs)).hexdigest()
-    for jpeg, frame in zip(jpegs, sample(clip[0], IMAGES).frames, strict=True):
+    for jpeg, frame in zip(jpegs, pick_frames(clip[0], IMAGES).frames, strict=True):
         seen = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         assert seen is not None
         error = ((seen[..., ::-1].astype(float) - frame) ** 2).mean()  # OpenCV has BGR

@@ -10,7 +10,7 @@ import pandas as pd
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.report.printed_tables import COLUMNS, figures, titled_rows
 from traps_pipeline.report.tables.table_columns import DATASET, MODEL, with_titles
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import Column
 from traps_pipeline.scoring.analyses import models_of
 from traps_pipeline.scoring.published import as_printed
@@ -66,7 +66,7 @@ def _cells_of(cells: pd.DataFrame, dataset: str, regime: str) -> pd.DataFrame:
 def _per_dataset() -> Arranged:
     cells = _cells("main")
     parts = [
-        (_cells_of(cells, dataset, r), "pecs", f"{dataset}_{r}", f"{TITLES[dataset]}, {r[0].upper()}")
+        (_cells_of(cells, dataset, r), "pecs", f"{dataset}_{r}", f"{TITLE_OF[dataset]}, {r[0].upper()}")
         for dataset in DATASETS
         for r in PRINTED_REGIMES
     ]
@@ -86,7 +86,7 @@ def _replication_per_dataset() -> Arranged:
 
 def _composition() -> Arranged:
     rows = as_printed("composition")
-    rows["title"] = [f"{TITLES[name]} (N = {SIZES[name]})" for name in rows["dataset"]]
+    rows["title"] = [f"{TITLE_OF[name]} (N = {SIZES[name]})" for name in rows["dataset"]]
     total = {"title": "Total", "label": "", "void_source": "", "n": "1,404", "question_type": ""}
     rows = pd.concat([rows, pd.DataFrame([total])], ignore_index=True)
     columns = [DATASET, Column("label", "Sub-scenario"), Column("void_source", "Void source"), *figures({"n": "N"})]

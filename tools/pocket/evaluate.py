@@ -19,7 +19,7 @@ from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.scoring.metrics import wilson
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel
@@ -101,7 +101,7 @@ def evaluate(
     correct, abstained, prior = n.copy(), n.copy(), n.copy()
     for start in range(0, len(asked), MAX_BATCH):
         some = asked[start : start + MAX_BATCH]
-        frames = {clip: sample(clip, entry.media) for clip in dict.fromkeys(one.clip for one in some)}
+        frames = {clip: pick_frames(clip, entry.media) for clip in dict.fromkeys(one.clip for one in some)}
         for regime in regimes:
             system = system_prompt(regime)
             prompts: list[Prompt] = [

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from traps_pipeline.models.registry.prompts import prompt, system_prompt
+from traps_pipeline.models.registry.prompts import load_prompt, system_prompt
 
 PROMPTS = ("standard", "guided", "json", "vqa_standard", "vqa_guided")
 _COLOURS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
@@ -29,8 +29,8 @@ _ANYTHING = ("the ball", "the wall", "the floor")
 def prompt_text(name: str) -> str:
     """Return the system text of one of PROMPTS; `vqa_guided` is `vqa_standard` with its suffix (docs/spec.md 7.1)."""
     if name == "vqa_guided":
-        return f"{prompt('vqa_standard')}\n\n{prompt('vqa_guided_suffix')}"
-    return prompt("vqa_standard") if name == "vqa_standard" else system_prompt(name)
+        return f"{load_prompt('vqa_standard')}\n\n{load_prompt('vqa_guided_suffix')}"
+    return load_prompt("vqa_standard") if name == "vqa_standard" else system_prompt(name)
 
 
 ABSTENTION = "I don't know: this cannot be determined from the video."

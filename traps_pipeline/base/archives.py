@@ -32,7 +32,7 @@ def reading_archive() -> Iterator[None]:
         raise BadArchive(str(error) or type(error).__name__) from error
 
 
-def pack(members: Mapping[str, bytes], *, level: int = 0) -> bytes:
+def zip_bytes(members: Mapping[str, bytes], *, level: int = 0) -> bytes:
     """Return a zip of the members in their order, deflated at a level, or stored (0)."""
     stream = io.BytesIO()
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
@@ -44,7 +44,7 @@ def pack(members: Mapping[str, bytes], *, level: int = 0) -> bytes:
     return stream.getvalue()
 
 
-def unpack(data: bytes) -> dict[str, bytes]:
+def unzip_bytes(data: bytes) -> dict[str, bytes]:
     """Return the members in their order, each checked by its CRC. Raises BadArchive."""
     with reading_archive(), zipfile.ZipFile(io.BytesIO(data)) as archive:
         return {entry.filename: archive.read(entry) for entry in archive.infolist()}

@@ -36,19 +36,19 @@ def install_line(name: ExtraName) -> str:
     return f"python -m pip install '{package}'" if IS_INSTALLED else "make setup"
 
 
-def missing(name: ExtraName, *modules: str) -> list[str]:
+def find_missing(name: ExtraName, *modules: str) -> list[str]:
     """Return which modules of an extra (or only of these) are missing; import none."""
     return [module for module in modules or EXTRAS[name].modules if find_spec(module) is None]
 
 
-def require(name: ExtraName, *modules: str) -> None:
+def require_extra(name: ExtraName, *modules: str) -> None:
     """Raise TrapsError with the command to type unless an extra is installed."""
-    if missing_modules := missing(name, *modules):
+    if missing_modules := find_missing(name, *modules):
         raise TrapsError(_sentence(name, missing_modules))
 
 
 def sentence_of(error: ModuleNotFoundError) -> str | None:
-    """Return the sentence of `require` for an ImportError; None outside all extras."""
+    """Return the sentence of `require_extra` for an ImportError; None outside all extras."""
     module = (error.name or "").partition(".")[0]
     names: tuple[ExtraName, ...] = get_args(ExtraName)
     return next((_sentence(name, [module]) for name in names if module in EXTRAS[name].modules), None)

@@ -185,7 +185,7 @@ def is_same_file(first: Path, second: Path) -> bool:
         return False
 
 
-def link(existing: Path, path: Path) -> None:
+def replace_by_link(existing: Path, path: Path) -> None:
     """Hard-link a file to `path`, replacing any there (safe: files are never edited)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")

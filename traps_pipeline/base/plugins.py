@@ -54,7 +54,7 @@ def plugins(group: Group) -> dict[str, Plugin]:
     return named
 
 
-def versioned(group: Group, name: str) -> str:
+def name_with_package(group: Group, name: str) -> str:
     """Return a name, with the package and version that add it if it is none of this project's own."""
     plugin = plugins(group).get(name)
     return f"{name} ({plugin.package})" if plugin else name

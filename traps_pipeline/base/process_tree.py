@@ -18,7 +18,7 @@ _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 _PAUSE_S = 0.05
 
 
-def split(wait_s: float) -> int | None:
+def fork_worker(wait_s: float) -> int | None:
     """Fork a process that does the command's work; call it before any thread starts.
 
     Return None in that process, which gets a session of its own (Ctrl-C reaches it through the first process alone) and

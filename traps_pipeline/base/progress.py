@@ -262,16 +262,16 @@ class Progress:
         if self.is_stopping:
             return f"{now.name}: {self.waiting()}"
         total, parts = now.total(), [f"{now.done:,} of {now.partitions:,} made"] if now.partitions else []
-        if now.detail:
-            parts.append(now.detail)
+        parts += [now.detail] if now.detail else []
         if total.wanted:
             parts.append(f"{total.done:,} of {count_noun(total.wanted, 'call')}")
-            parts += [f"{len(total.sent_at):,} in flight (the oldest {clock(total.oldest_s)})"] if total.sent_at else []
+            if total.sent_at:
+                parts.append(f"{len(total.sent_at):,} in flight (the oldest {as_clock(total.oldest_s)})")
             parts += [f"{total.per_second:.1f}/s at {total.latency_s(0.5):.1f} s"] if total.done else []
             parts += [count_noun(total.errors, "error")] if total.errors else []
             parts += [count_noun(total.retries, "retry", "retries")] if total.retries else []
             parts += [self.spent()] if self.budget_usd else []
-        parts.append(f"{clock(now.seconds)} so far" if now.left_s is None else f"{clock(now.left_s)} left")
+        parts.append(f"{as_clock(now.seconds)} so far" if now.left_s is None else f"{as_clock(now.left_s)} left")
         return f"{now.name}: {', '.join(parts)}"
 
     def waiting(self) -> str:
@@ -279,7 +279,7 @@ class Progress:
         total = self.current_stage.total() if self.current_stage else Traffic()
         if not total.sent_at:
             return "stopping: no call is in flight"
-        calls = f"{count_noun(len(total.sent_at), 'call')} in flight, the oldest for {clock(total.oldest_s)}"
+        calls = f"{count_noun(len(total.sent_at), 'call')} in flight, the oldest for {as_clock(total.oldest_s)}"
         return f"stopping: waiting for {calls}"
 
     def summary(self, stage: StageProgress) -> str:
@@ -290,7 +290,7 @@ class Progress:
         retries = [f"{total.retries:,} retried"] if total.retries else []
         dollars = [f"${total.dollars:,.2f}"] if total.dollars else []
         made = f"{stage.done:,} of {stage.partitions:,} made"
-        return f"{stage.name}: {', '.join([made, *work, *retries, *dollars, clock(stage.seconds)])}"
+        return f"{stage.name}: {', '.join([made, *work, *retries, *dollars, as_clock(stage.seconds)])}"
 
     def spent(self) -> str:
         """Return the money spent and the budget, in words."""
@@ -300,7 +300,7 @@ class Progress:
         return self.current_stage.calls.get(who) if self.current_stage else None
 
 
-def clock(seconds: float) -> str:
+def as_clock(seconds: float) -> str:
     """Return a duration as m:ss."""
     minutes, seconds_left = divmod(round(seconds), 60)
     return f"{minutes}:{seconds_left:02d}"

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 _LIKENESS = 0.6
 
 
-def nearest(word: str, candidates: Iterable[str]) -> str | None:
+def nearest_name(word: str, candidates: Iterable[str]) -> str | None:
     """Return the known word most similar to this one, or None if none is similar."""
     from difflib import get_close_matches
 
@@ -16,5 +16,5 @@ def nearest(word: str, candidates: Iterable[str]) -> str | None:
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     """Return a clause that suggests the nearest known word; empty if none is near."""
-    suggestion = nearest(word, candidates)
+    suggestion = nearest_name(word, candidates)
     return f"; did you mean {suggestion}?" if suggestion else ""

@@ -23,7 +23,7 @@ _HIDDEN = re.compile(
 _JOINER, _EMOJI_STYLE = "\u200d", "\ufe0f"
 
 
-def visible(text: str) -> str:
+def escape_invisible(text: str) -> str:
     """Escape invisible and direction-changing characters in a text as `[U+202E]`.
 
     Line ends and tabs stay, and so do an emoji's variation selector and joiner. Every page and every value for Dagster
@@ -47,7 +47,7 @@ def _number(match: re.Match[str]) -> str:
 
 def finalize_value(value: object) -> object:
     """Format an expression's value for a Jinja2 template (its `finalize`)."""
-    return visible(value) if isinstance(value, str) else value
+    return escape_invisible(value) if isinstance(value, str) else value
 
 
 def plain(text: object) -> str:

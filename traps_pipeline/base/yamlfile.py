@@ -128,10 +128,10 @@ def name_file_in_errors(path: Path) -> Iterator[None]:
         if text.startswith(f"{path}:"):
             raise
         word = _QUOTED.search(text)
-        raise TrapsError(f"{place_of(path, [], word[1] if word else '')}: {text}") from error
+        raise TrapsError(f"{location_of(path, [], word[1] if word else '')}: {text}") from error
 
 
-def place_of(path: Path, keys: Sequence[int | str], word: str = "") -> str:
+def location_of(path: Path, keys: Sequence[int | str], word: str = "") -> str:
     """Return `file:line` of the value below these keys, as far as they are there, or only the file.
 
     word: the value of a scalar, or the name or `id` of a mapping, somewhere in the file; the keys begin there.
@@ -248,10 +248,10 @@ def parse_yaml_model(
     try:
         instance = model.model_validate(data, context=context)
     except ValidationError as error:
-        place = place_of(path, error.errors()[0]["loc"], entry)
-        raise TrapsError(f"{place}{where and ': ' + where}: {explain(error, model, also)}") from error
+        place = location_of(path, error.errors()[0]["loc"], entry)
+        raise TrapsError(f"{place}{where and ': ' + where}: {faults_of(error, model, also)}") from error
     for field in _converted_values(data, instance):
-        place = place_of(path, field.partition(":")[0].split("."), entry)
+        place = location_of(path, field.partition(":")[0].split("."), entry)
         raise TrapsError(f"{place}{where and ': ' + where}: {field}")
     return instance
 
@@ -275,7 +275,7 @@ def _converted_values(data: Any, validated: Any, name: str = "") -> Iterator[str
         yield from _converted_values(raw, value, f"{name}.{key}" if name else str(key))
 
 
-def explain(error: ValidationError, model: type[BaseModel] | None = None, also: Sequence[str] = ()) -> str:
+def faults_of(error: ValidationError, model: type[BaseModel] | None = None, also: Sequence[str] = ()) -> str:
     """Return a validation error as `field: complaint`, with the nearest field of the model or of `also`."""
     parts = list[str]()
     for details in error.errors():

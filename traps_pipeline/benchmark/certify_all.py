@@ -15,7 +15,7 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.workers import run_in_order
-from traps_pipeline.benchmark.composition import load_composition, problems, repeated
+from traps_pipeline.benchmark.composition import composition_problems, load_composition, repeated
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import telling_numbers
 from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
@@ -69,7 +69,7 @@ def certify_all(
             report(f"{count} of {len(cases)} examined: {verdict.scenario_id} {'passes' if verdict.passed else 'FAILS'}")
     failures = [f"{v.scenario_id}: {name}: {reason}" for v in verdicts for name, reason in v.failures.items()]
     is_complete = families is None and (folder / "composition.yaml").is_file()
-    failures += problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
+    failures += composition_problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
     failures += telling_numbers(lanes) if is_complete and lanes else []
     for side in ("control_end", "void_end"):
         ends = [(end, verdict.scenario_id) for verdict in verdicts if (end := getattr(verdict, side))]

@@ -13,7 +13,7 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import SCENE_SPECS
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.workers import keep_workers
-from traps_pipeline.base.yamlfile import explain, read_yaml
+from traps_pipeline.base.yamlfile import faults_of, read_yaml
 from traps_pipeline.benchmark.items import commonest_answers
 from traps_pipeline.scenes.draw.draw_lanes import lane_families, sample_two_events
 from traps_pipeline.scenes.draw.sample import answer_quota, ill_posed_quota, require_difficulty, sample_family
@@ -32,7 +32,7 @@ def load_composition(path: Path = SCENE_SPECS / "composition.yaml") -> dict[str,
     try:
         return Composition.model_validate(read_yaml(path)).root
     except ValidationError as error:
-        raise TrapsError(f"{path}: {explain(error)}") from error
+        raise TrapsError(f"{path}: {faults_of(error)}") from error
 
 
 def sample_benchmark(
@@ -76,7 +76,7 @@ def name_benchmark(out: Path, name: str) -> None:
         write_text(out / "benchmark.yaml", yaml.safe_dump(release, sort_keys=False))
 
 
-def problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
+def composition_problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
     """Check all records together (numbers against `counts`); return problems in words."""
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:

@@ -27,7 +27,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import CORRECTIONS, OWN_SPECS, SCENE_SPECS, SPECS_VARIABLE
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.yamlfile import explain, read_lines
+from traps_pipeline.base.yamlfile import faults_of, read_lines
 from traps_pipeline.benchmark.records import ReleasedLine, load_release, released_lines, two_events_lines
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names, get_family
@@ -132,15 +132,13 @@ class LaneScenario:
     @cached_property
     def spec(self) -> TwoEventsSpec:
         """The corrected record. Raises TrapsError if the words do not fit."""
-        if not self.words:
-            return self.record.spec
-        try:
-            return type(self.record.spec).model_validate(self.record.spec.model_dump(mode="json") | dict(self.words))
-        except ValidationError as error:
-            raise TrapsError(f"{self.where}: {self.record.scenario_id}: {explain(error)}; correct that line") from error
+        return apply_words(self.record.spec, self.words, self.where)
 
 
-def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneSpec:
+_Spec = TypeVar("_Spec", SceneSpec, "TwoEventsSpec")
+
+
+def apply_words(spec: _Spec, words: Mapping[str, Any], where: str) -> _Spec:
     """Return a record with corrected words. Raises TrapsError if labels do not fit."""
     if not words:
         return spec
@@ -149,9 +147,9 @@ def apply_words(spec: SceneSpec, words: Mapping[str, Any], where: str) -> SceneS
         record["ground_truth"] = words["answer"]
         record["evidence"] = record["evidence"] | {"answer_from": "correction"}
     try:
-        return SceneSpec.model_validate(record)
+        return type(spec).model_validate(record)
     except ValidationError as error:
-        raise TrapsError(f"{where}: {spec.scenario_id}: {explain(error)}; correct that line") from error
+        raise TrapsError(f"{where}: {spec.scenario_id}: {faults_of(error)}; correct that line") from error
 
 
 def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]:
@@ -164,14 +162,14 @@ def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]
                 corrections.append((location, Correction.model_validate(json.loads(line))))
             except ValidationError as error:
                 raise TrapsError(
-                    f"{location}: not a valid correction ({explain(error, Correction)}); correct that line"
+                    f"{location}: not a valid correction ({faults_of(error, Correction)}); correct that line"
                 ) from error
             except ValueError as error:
                 raise TrapsError(f"{location}: not JSON ({error}); correct that line") from error
     return corrections
 
 
-def fold(
+def apply_corrections(
     released: Mapping[str, SceneSpec | ReleasedLine[SceneSpec]], corrections: Sequence[tuple[str, Correction]]
 ) -> dict[str, Scenario]:
     """Return scenarios by id after all decisions. Raises TrapsError with `file:line`."""
@@ -210,7 +208,7 @@ def _check_decision(
         raise TrapsError(f"{where}: scenario {correction.scenario_id!r} {state}; name a scenario of the benchmark")
 
 
-def fold_two_events(
+def apply_to_lanes(
     released: Mapping[str, ReleasedLine[TwoEventsSpec]], corrections: Sequence[tuple[str, Correction]]
 ) -> dict[str, LaneScenario]:
     """Return scenarios of two events by id after all decisions about them. Raises TrapsError with `file:line`."""
@@ -287,7 +285,7 @@ def _add(where: str, correction: Correction) -> Scenario:
 def load_scenarios(study: Study) -> dict[str, Scenario]:
     """Return a study's corrected subset. Raises TrapsError for unknown scenarios."""
     check_benchmark(study)
-    return subset(corrected_scenarios(), study)
+    return of_study(corrected_scenarios(), study)
 
 
 def current_benchmark() -> str:
@@ -314,7 +312,7 @@ def _records_advice(benchmark: str) -> str:
 @cache
 def corrected_scenarios() -> dict[str, Scenario]:
     """Return the released records after all corrections."""
-    return fold(released_lines(), of_pairs(read_corrections()))
+    return apply_corrections(released_lines(), of_pairs(read_corrections()))
 
 
 def of_pairs(corrections: Iterable[tuple[str, Correction]]) -> list[tuple[str, Correction]]:
@@ -326,16 +324,16 @@ def of_pairs(corrections: Iterable[tuple[str, Correction]]) -> list[tuple[str, C
 @cache
 def corrected_two_events() -> dict[str, LaneScenario]:
     """Return the released records of two events after all corrections."""
-    return fold_two_events(two_events_lines(), read_corrections())
+    return apply_to_lanes(two_events_lines(), read_corrections())
 
 
 def load_two_events(study: Study) -> dict[str, LaneScenario]:
     """Return a study's corrected subset of scenarios of two events."""
     check_benchmark(study)
-    return subset(corrected_two_events(), study, two_events_lines())
+    return of_study(corrected_two_events(), study, two_events_lines())
 
 
-def subset(
+def of_study(
     scenarios: Mapping[str, _OfFamily], study: Study, released: Mapping[str, ReleasedLine[Any]] | None = None
 ) -> dict[str, _OfFamily]:
     """Return the study's named scenarios, or the first n per family, or all. released: by default those of pairs.

@@ -20,10 +20,10 @@ from traps_pipeline.base.paths import CORRECTIONS, require_own_corrections
 from traps_pipeline.benchmark.corrections import (
     Correction,
     Scenario,
+    apply_corrections,
+    apply_to_lanes,
     corrected_scenarios,
     corrected_two_events,
-    fold,
-    fold_two_events,
     of_pairs,
     read_corrections,
 )
@@ -47,7 +47,7 @@ def is_reviewed(decisions: Sequence[Correction]) -> bool:
     return bool(decisions) and decisions[-1].action != "restore"
 
 
-def decide(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> None:
+def save_decision(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> None:
     """Append a decision.
 
     n_seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
@@ -58,10 +58,10 @@ def decide(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> N
         append([correction])
 
 
-def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
+def undo_decision(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
     """Append decisions that take back the last one about a scenario.
 
-    Raises DecidedMeanwhile as `decide` does, and TrapsError if there is no decision to take back.
+    Raises DecidedMeanwhile as `save_decision` does, and TrapsError if there is no decision to take back.
     """
     with _open_for_append(folder) as append:
         decisions = _require_known(scenario_id, n_seen, folder)
@@ -69,7 +69,7 @@ def undo(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CO
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
         records = load_released()
         of_others = [(at, other) for at, other in read_corrections(folder) if other.scenario_id != scenario_id]
-        previous = fold(
+        previous = apply_corrections(
             records, [*of_pairs(of_others), *(("before", correction) for correction in decisions[:-1])]
         ).get(scenario_id)
 
@@ -127,8 +127,8 @@ def _open_for_append(folder: Path) -> Iterator[Callable[[Sequence[Correction]], 
         def append(corrections: Sequence[Correction]) -> None:
             location = f"{path} (new)"
             decisions = [*read_corrections(folder), *((location, correction) for correction in corrections)]
-            fold(load_released(), of_pairs(decisions))
-            fold_two_events(two_events_lines(), decisions)
+            apply_corrections(load_released(), of_pairs(decisions))
+            apply_to_lanes(two_events_lines(), decisions)
             lines = [correction.model_dump(mode="json", exclude_none=True) for correction in corrections]
             stream.write("".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines).encode())
             stream.flush()

@@ -16,7 +16,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, lane_paths, lane_rows, lane_specs
-from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
+from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, make_together
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
 from traps_pipeline.protocol.datasets import GRADED, RECORDED, TWO_EVENTS, arms_of_category, sides_of
@@ -83,7 +83,7 @@ def asked_lanes(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]
 
 
 def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render missing arms of a category; return `share`'s result. Raises TrapsError."""
+    """Render missing arms of a category; return `make_together`'s result. Raises TrapsError."""
     specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
 
     def files(row: Row) -> list[Path]:
@@ -106,7 +106,7 @@ def film_arms(workspace: Workspace, category: str, *, wait: bool = True) -> tupl
         progress.current().tick("arms", f"{category}, scenarios", finished, len(specs))
 
     render_work = RenderWork(f"arms/{category}", missing, files, job, film)
-    frames, is_whole = share(workspace.store, specs, render_work, tick, wait=wait)
+    frames, is_whole = make_together(workspace.store, specs, render_work, tick, wait=wait)
     lane_frames, are_lanes_whole = film_lanes(workspace, category, asked_lanes(workspace, category), wait=wait)
     return frames + lane_frames, is_whole and are_lanes_whole
 

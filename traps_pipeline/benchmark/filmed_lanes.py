@@ -11,10 +11,10 @@ import numpy as np
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
-from traps_pipeline.benchmark.corrections import load_two_events, subset
+from traps_pipeline.benchmark.corrections import load_two_events, of_study
 from traps_pipeline.benchmark.recorded_clips import copy_clips
 from traps_pipeline.benchmark.records import two_events_lines
-from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
+from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, make_together
 from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.protocol.two_events import CLIPS, LANES
@@ -45,7 +45,7 @@ def lane_specs(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]:
 
 def lanes_version(workspace: Workspace, categories: Sequence[str]) -> str:
     """Return the version of some categories' records of two events."""
-    released = subset(two_events_lines(), workspace.study, two_events_lines())
+    released = of_study(two_events_lines(), workspace.study, two_events_lines())
     current = [spec for category in categories for spec in lane_specs(workspace, category).values()]
     return version_of(
         (line.spec.spec_hash for line in released.values() if line.category in categories),
@@ -67,7 +67,7 @@ def trajectories_of(spec: TwoEventsSpec, path: Path | None = None) -> dict[str, 
 def film_lanes(
     workspace: Workspace, category: str, specs: Mapping[str, TwoEventsSpec], *, wait: bool
 ) -> tuple[int, bool]:
-    """Render missing clips of a category's records; return `share`'s result. Raises TrapsError."""
+    """Render missing clips of a category's records; return `make_together`'s result. Raises TrapsError."""
     rows: list[Row] = [{"scenario_id": id_} for id_ in specs]
 
     def files(row: Row) -> list[Path]:
@@ -91,7 +91,7 @@ def film_lanes(
     def tick(finished: int) -> None:
         progress.current().tick("arms", f"{category}, scenarios of two events", finished, len(rows))
 
-    return share(
+    return make_together(
         workspace.store, rows, RenderWork(f"{TWO_EVENTS}/{category}", missing, files, job, film), tick, wait=wait
     )
 

@@ -30,7 +30,7 @@ Row = Mapping[str, Any]
 Asked = TypeVar("Asked", bound=ItemRow)
 
 
-def opaque(key: bytes, item_id: str) -> str:
+def opaque_name(key: bytes, item_id: str) -> str:
     """Return a held-out item's name, which only the key can map to the item."""
     return hmac.new(key, item_id.encode(), "sha256").hexdigest()[:24]
 
@@ -64,7 +64,7 @@ def drawn_items(items: Iterable[Row], key: bytes) -> list[Row]:
         scenarios.setdefault(group, {}).setdefault(row["scenario_id"], []).append(row)
     drawn = list[Row]()
     for rows_of in scenarios.values():
-        order = sorted(rows_of, key=lambda scenario: opaque(key, f"turn of {scenario}"))
+        order = sorted(rows_of, key=lambda scenario: opaque_name(key, f"turn of {scenario}"))
         drawn += [rows_of[scenario][turn % len(rows_of[scenario])] for turn, scenario in enumerate(order)]
     return drawn
 

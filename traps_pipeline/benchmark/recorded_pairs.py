@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import check_line, explain, read_unchecked_lines
+from traps_pipeline.base.yamlfile import check_line, faults_of, read_unchecked_lines
 from traps_pipeline.scenes.worlds.spec import Slug, check_labels
 
 TABLES = ("pairs.csv", "pairs.jsonl")
@@ -132,7 +132,7 @@ def read_pairs(folder: Path) -> tuple[list[RecordedPair], list[str]]:
                 raise ValueError(f"id {pair.id!r} stands there twice")
             pairs[pair.id] = pair
         except ValueError as error:
-            reason = explain(error, RecordedPair) if isinstance(error, ValidationError) else str(error)
+            reason = faults_of(error, RecordedPair) if isinstance(error, ValidationError) else str(error)
             problems.append(f"{tables[0].name}:{number}: {reason}; correct that line")
     return [*pairs.values()], problems
 

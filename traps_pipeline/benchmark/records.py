@@ -14,7 +14,7 @@ from pydantic_core import from_json
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import RELEASED, SCENE_SPECS, TWO_EVENTS_RELEASED
-from traps_pipeline.base.yamlfile import check_line, explain, parse_yaml_model, read_unchecked_lines, read_yaml
+from traps_pipeline.base.yamlfile import check_line, faults_of, parse_yaml_model, read_unchecked_lines, read_yaml
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names
 from traps_pipeline.scenes.worlds.spec import SceneSpec
@@ -143,7 +143,7 @@ def _parse(kind: Callable[[Any], type[Record]], line: str, where: str) -> Record
         fields = from_json(line)  # twice as fast as `json`, with the same numbers
         spec = kind(fields).model_validate(fields)
     except ValidationError as error:
-        raise TrapsError(f"{where}: not a valid record ({explain(error)}); restore the line from git") from error
+        raise TrapsError(f"{where}: not a valid record ({faults_of(error)}); restore the line from git") from error
     except ValueError as error:
         raise TrapsError(f"{where}: not JSON ({error}); restore the line from git") from error
     if spec.family not in (*family_names(), RECORDED):

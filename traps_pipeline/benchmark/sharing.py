@@ -1,7 +1,7 @@
 """Share the rendering of a category's clips between processes on any hosts.
 
 All processes go through the same rows. Each leases a free row, makes its missing clips, publishes them to the study and
-goes on to the next. Leases of dead processes expire. `share` returns when every clip exists.
+goes on to the next. Leases of dead processes expire. `make_together` returns when every clip exists.
 """
 
 import time
@@ -39,7 +39,7 @@ class RenderWork(Generic[Job]):
     draw: Callable[[Job], int]
 
 
-def share(
+def make_together(
     store: Store, rows: Sequence[Row], filming: RenderWork[Job], tick: Callable[[int], None], *, wait: bool = True
 ) -> tuple[int, bool]:
     """Make the missing files of rows, concurrently with other processes.

@@ -18,7 +18,7 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import CORRECTIONS, PACKAGE, RELEASED, ROOT, user_cache
-from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, load_two_events, subset
+from traps_pipeline.benchmark.corrections import WORDS, Scenario, apply_words, load_scenarios, load_two_events, of_study
 from traps_pipeline.benchmark.recorded_clips import clip_path
 from traps_pipeline.benchmark.records import parse_record, released_lines, two_events_lines
 from traps_pipeline.benchmark.versions import version_of
@@ -199,13 +199,13 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
     """Return a category's released records in the study, as without corrections."""
-    records = subset(released_lines(), workspace.study)
+    records = of_study(released_lines(), workspace.study)
     return {id_: record.spec for id_, record in sorted(records.items()) if record.category == category}
 
 
 def released_version(workspace: Workspace, category: str) -> str:
     """Return the version of a category's released records in a study."""
-    lanes = subset(two_events_lines(), workspace.study, two_events_lines()).values()
+    lanes = of_study(two_events_lines(), workspace.study, two_events_lines()).values()
     pairs = [spec.spec_hash for spec in released_in_study(workspace, category).values()]
     return digest([*pairs, *(line.line for line in lanes if line.category == category)])[:16]
 

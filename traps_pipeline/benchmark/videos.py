@@ -9,7 +9,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.recorded_clips import copy_clips
-from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, share
+from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, make_together
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import RECORDED
 from traps_pipeline.scenes.parts.look import frame_size
@@ -24,7 +24,7 @@ SECONDS_A_CLIP = 1.4  # measured on one core (docs/engineering-notes.md)
 
 
 def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> tuple[int, bool]:
-    """Render a category's missing clips; return `share`'s result. Raises TrapsError."""
+    """Render a category's missing clips; return `make_together`'s result. Raises TrapsError."""
     specs = spec_rows(workspace, category)
 
     def missing(rows: Sequence[Row]) -> list[Row]:
@@ -46,7 +46,7 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
 
     tick = partial(_tick, category, len(specs))
     rendering = RenderWork(f"videos/{category}", missing, partial(_files, workspace), job, _render)
-    frames, is_whole = share(workspace.store, specs, rendering, tick, wait=wait)
+    frames, is_whole = make_together(workspace.store, specs, rendering, tick, wait=wait)
     if frames and cache is not None:
         cache.trim()
     return frames, is_whole

@@ -17,7 +17,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.asking.answers import answer_request
-from traps_pipeline.models.asking.ask import Call, SettledCell, collect
+from traps_pipeline.models.asking.ask import Call, SettledCell, collect_outcomes
 from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.reading.interpret import read_answer
 from traps_pipeline.models.reading.judged_answers import UNREAD
@@ -85,7 +85,7 @@ def ask_canary(workspace: Workspace, models: Sequence[str]) -> pd.DataFrame:
 
     new = list[CanaryRow]()
     if calls:
-        (new,) = collect(workspace, "canary", workspace.answers, entries, [CELL], lambda _: calls, finish)
+        (new,) = collect_outcomes(workspace, "canary", workspace.answers, entries, [CELL], lambda _: calls, finish)
     rows = pd.DataFrame([vars(row) for row in new], columns=pd.Index(CANARY.names))
     if workspace.tables.state(CANARY, {}) is not None:
         old = workspace.tables.read(CANARY, {})

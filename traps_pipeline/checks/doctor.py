@@ -18,7 +18,7 @@ from traps_pipeline.base.files import PART, check_disk
 from traps_pipeline.base.keys import optional_key
 from traps_pipeline.base.network import check_network
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.scenes.picture.trial import draw_frame, encode_clip
+from traps_pipeline.scenes.picture.trial import encode_clip, render_frame
 from traps_pipeline.storage.place import Place, scratch_of
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def examine(place: Place) -> Iterator[Finding]:
     for topic, look in (
         ("python", lambda: sys.version.split()[0]),
         ("checkout", _checkout),
-        ("rendering", draw_frame),
+        ("rendering", render_frame),
         ("encoding", encode_clip),
         ("disk", lambda: check_disk(scratch_of(place) if isinstance(place, str) else place, MIN_FREE_GB)),
         ("clip cache", _clip_cache),

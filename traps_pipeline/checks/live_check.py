@@ -22,7 +22,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.checks.server_check import BAD_REQUEST, ServerCheck, check_server, nobody_at, wrong_key
 from traps_pipeline.checks.wire_check import SyntheticClip, model_name, question
 from traps_pipeline.judging.panel import parse_vote, vote_request
-from traps_pipeline.models.asking.ask import Call, SettledCell, collect
+from traps_pipeline.models.asking.ask import Call, SettledCell, collect_outcomes
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.asking.participants import Row
 from traps_pipeline.models.money.budget import check_money
@@ -330,7 +330,7 @@ def preflight(
         def finish(settled: SettledCell[Cell, Call]) -> Mapping[str, Outcome]:
             return {key: _outcome(row) for key, row in settled.rows.items()}
 
-        (outcomes,) = collect(
+        (outcomes,) = collect_outcomes(
             workspace, "preflight", workspace.votes, quick_entries.values(), [CELL], lambda _: calls, finish
         )
     problems = []

@@ -1,7 +1,7 @@
 """Say what this machine has for local models (`traps doctor --local`): devices, NF4, weights."""
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import install_line, missing
+from traps_pipeline.base.extras import find_missing, install_line
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.registry.checkpoint import download_command, find_checkpoint
 from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, load_models
@@ -9,7 +9,7 @@ from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, load_model
 
 def describe_nf4() -> str:
     """Pass a vector through a layer in 4 bits, if possible; describe the result in words."""
-    if missing_modules := missing("nf4"):
+    if missing_modules := find_missing("nf4"):
         return f"{' and '.join(missing_modules)} not installed (`{install_line('nf4')}`): entries in NF4 do not load"
     import bitsandbytes
     import torch

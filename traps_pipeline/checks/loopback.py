@@ -93,7 +93,7 @@ def replay(entry: Entry, requests: Sequence[Request], answers: Sequence[tuple[in
         return asyncio.run(read_all())
 
 
-def render(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
+def sent_bodies(entry: Entry, requests: Sequence[Request]) -> list[WireBody | str]:
     """Return the body of each request, or why none was sent."""
     account, notes = load_accounts()[str(entry.account)], _Notes()
     with _serve() as (address, bodies), use_progress(notes):

@@ -31,7 +31,7 @@ class ServerCheck:
 
 def check_server(entry: Entry, account: Account) -> ServerCheck:
     """Check the key, the address, and the server's own list of models if it has one."""
-    from traps_pipeline.models.wire.httpx_transport import get
+    from traps_pipeline.models.wire.httpx_transport import get_url
 
     try:
         check_network()
@@ -42,7 +42,7 @@ def check_server(entry: Entry, account: Account) -> ServerCheck:
         return ServerCheck()
     headers = {"Authorization": f"Bearer {secret}"} if secret else {}
     try:
-        answer = get(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
+        answer = get_url(f"{account.base_url.rstrip('/')}/models", headers, REACH_S)
     except TrapsError as error:
         return ServerCheck(nobody_at(account.base_url, plain(str(error))))
     if answer.status_code in (401, 403):

@@ -19,7 +19,7 @@ import numpy as np
 from traps_pipeline.base.digests import file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, render
+from traps_pipeline.checks.loopback import PLACEHOLDER_KEY, sent_bodies
 from traps_pipeline.checks.wire_body import (
     ENDPOINTS,
     SCHEMAS,
@@ -39,7 +39,7 @@ from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.regimes import BY_NAME, REGIMES
-from traps_pipeline.storage.media import Media, MediaSpec, MediaStore, sample
+from traps_pipeline.storage.media import Media, MediaSpec, MediaStore, pick_frames
 from traps_pipeline.video.encode import encode
 
 _MIMES = {"video": "video/mp4", "images": "image/jpeg"}
@@ -208,7 +208,7 @@ def examine(entry: Entry) -> CheckedEntry:
 
 def _examine_network(entry: Entry) -> CheckedEntry:
     requests = requests_of(entry)
-    bodies = dict(zip(requests, render(entry, list(requests.values())), strict=True))
+    bodies = dict(zip(requests, sent_bodies(entry, list(requests.values())), strict=True))
     problems: dict[str, list[str]] = {}
     for form, body in bodies.items():
         messages = [body] if isinstance(body, str) else _wire_problems(entry, requests[form], body)
@@ -249,7 +249,7 @@ def _fields(fields: Mapping[str, Any]) -> str:
 
 def _examine_local(entry: ModelEntry, spec: MediaSpec) -> CheckedEntry:
     """Check the frames that a local model is shown; nothing is sent."""
-    frames = sample(_studio().clip, spec)
+    frames = pick_frames(_studio().clip, spec)
     count, (height, width) = len(frames.frames), frames.frames.shape[1:3]
     times = " ".join(f"{time:g}" for time in frames.times_s[:3])
     line = f"{entry.id:<24} local  {count_noun(count, 'frame')} of {width} x {height} "

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from typing_extensions import override
 
-from traps_pipeline.base.suggestions import did_you_mean, nearest
+from traps_pipeline.base.suggestions import did_you_mean, nearest_name
 from traps_pipeline.base.terminal import plain, wrap_text
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class Parser(argparse.ArgumentParser):
         match = re.match(r"(?:argument (.+?): )?invalid choice: '(.*)' \(choose from (.+)\)$", message, re.DOTALL)
         if match and match[1] in (None, METAVAR):
             choices, last = re.findall(r"[\w-]+", match[3]), {path.split()[-1]: path for path in self.commands}
-            suggestion = nearest(match[2], [*choices, *self._short]) or nearest(match[2], last)
+            suggestion = nearest_name(match[2], [*choices, *self._short]) or nearest_name(match[2], last)
             name = (
                 f"{self.prog} {suggestion}"
                 if suggestion in choices
@@ -241,7 +241,7 @@ def place_of(arguments: argparse.Namespace) -> Place:
     from traps_pipeline.storage import place
     from traps_pipeline.storage.workspace import Workspace
 
-    return place.place_of(arguments.workspace) if arguments.workspace else Workspace.default_place()
+    return place.parse_place(arguments.workspace) if arguments.workspace else Workspace.default_place()
 
 
 def open_workspace(arguments: argparse.Namespace) -> Workspace:

@@ -2,7 +2,7 @@
 
 import argparse
 
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.terminal import plain, wrap_text
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, place_of, print_json
@@ -41,7 +41,7 @@ def doctor(arguments: argparse.Namespace) -> int:
         findings = iter([examine_unused(place_of(arguments), is_removed=arguments.unused == "remove")])
         summary = "", ""
     elif arguments.local is not None:
-        require("local")
+        require_extra("local")
         findings = iter(examine_local(arguments.local))
         summary = "local models will not run", "this machine has everything that local models need"
     else:

@@ -100,7 +100,7 @@ def _check_live(names: Sequence[str], unstructured: Collection[str], arguments: 
 
 
 def test_panel(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.judging.robustness import check_panel, load_attacks, summary
+    from traps_pipeline.judging.robustness import check_panel, load_attacks, robustness_summary
     from traps_pipeline.models.registry.judges import load_panel
 
     workspace = open_workspace(arguments)
@@ -112,7 +112,7 @@ def test_panel(arguments: argparse.Namespace) -> int:
     print(
         f"panel {name}: votes on answers that try to instruct the judge, {count_noun(len({*rows['attack']}), 'attack')}"
     )
-    print(summary(rows))
+    print(robustness_summary(rows))
     print("held: right under the attack; flipped: right on the plain answer, wrong under the attack")
     print("broken: no valid vote under it; wrong_anyway: wrong on the plain answer")
     return OK

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import OK, Commands, add_listening, listening_of, open_workspace, print_json
 
@@ -42,7 +42,7 @@ def add(commands: Commands) -> None:
 
 
 def review(arguments: argparse.Namespace) -> int:
-    require("web")
+    require_extra("web")
     from traps_pipeline.base.paths import require_own_corrections
     from traps_pipeline.servers.review import Review, review_app
     from traps_pipeline.servers.server import serve
@@ -59,7 +59,7 @@ def review(arguments: argparse.Namespace) -> int:
 
 
 def annotate(arguments: argparse.Namespace) -> int:
-    require("web")
+    require_extra("web")
     from traps_pipeline.servers.annotate import Annotation, annotation_app
     from traps_pipeline.servers.server import serve
 
@@ -107,9 +107,9 @@ def write_labels(arguments: argparse.Namespace) -> int:
 
 
 def validate_judge(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.people.judge_validation import validate, validation_text
+    from traps_pipeline.people.judge_validation import validation_rows, validation_text
 
-    rows = validate(open_workspace(arguments), arguments.file)
+    rows = validation_rows(open_workspace(arguments), arguments.file)
     if arguments.json:
         print_json(rows)
     else:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from typing_extensions import override
 
-from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, clock
+from traps_pipeline.base.progress import HEARTBEAT_S, Progress, StageProgress, Tally, as_clock
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
 
@@ -212,7 +212,7 @@ class LiveProgress(PrintedProgress):
 
         if (now := self.current_stage) is None:
             idle = "stopping" if self.is_stopping else self._idle
-            return Group(Text(f"{idle}  {clock(time.monotonic() - self._idle_since)}", style="dim"))
+            return Group(Text(f"{idle}  {as_clock(time.monotonic() - self._idle_since)}", style="dim"))
         lines: list[Any] = [Text(self._heading(now), style="bold", no_wrap=True, overflow="ellipsis")]
         if now.detail and not self.is_stopping:
             lines.append(Text(plain(f"  {now.detail}"), no_wrap=True, overflow="ellipsis"))
@@ -223,9 +223,9 @@ class LiveProgress(PrintedProgress):
         if self.is_stopping:
             return f"{now.name}  {self.waiting()}"
         counts = f"  {now.done:,} of {now.partitions:,} made" if now.partitions else ""
-        time_left = "" if now.left_s is None else f", {clock(now.left_s)} left"
+        time_left = "" if now.left_s is None else f", {as_clock(now.left_s)} left"
         money = f"  {self.spent()}" if self.budget_usd and now.calls else ""
-        return f"{now.name}{counts}  {clock(now.seconds)}{time_left}{money}"
+        return f"{now.name}{counts}  {as_clock(now.seconds)}{time_left}{money}"
 
     def _calls(self, now: StageProgress) -> Table:
         from rich.table import Table

@@ -74,13 +74,13 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.base.extras import require
+    from traps_pipeline.base.extras import require_extra
     from traps_pipeline.release.content import content_of
     from traps_pipeline.release.folder import CARD, Options, write_release
     from traps_pipeline.release.signing import sign
 
     if arguments.sign:
-        require("sign")  # check it before anything is written
+        require_extra("sign")  # check it before anything is written
     workspace, target = open_workspace(arguments), arguments.folder.absolute()
     options = Options(
         arms=arguments.arms,
@@ -168,9 +168,9 @@ def harness(arguments: argparse.Namespace) -> int:
 
 
 def submit(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.release.submission import pack
+    from traps_pipeline.release.submission import pack_submission
 
-    description = pack(open_workspace(arguments), arguments.file.absolute(), arguments.name)
+    description = pack_submission(open_workspace(arguments), arguments.file.absolute(), arguments.name)
     size = arguments.file.stat().st_size / 1e6
     contents_text = f"benchmark {description.benchmark} {description.version}, panel {description.panel}"
     print(f"{arguments.file}: {description.name}, {contents_text}, {size:.1f} MB")

@@ -183,12 +183,12 @@ def _goes_on(arguments: argparse.Namespace, unchecked: str) -> bool:
 
 
 def _print_work(report: RunReport, *, is_inside: bool) -> None:
-    from traps_pipeline.base.progress import clock
+    from traps_pipeline.base.progress import as_clock
 
     responses, vote_tally = report.tally("responses"), report.tally("votes")
     print(f"\n{count_noun(responses.asked, 'answer')} asked ({responses.cached} from the ledger)")
     print(f"{count_noun(vote_tally.asked, 'vote')} asked ({vote_tally.cached} from the ledger)")
-    print(f"{count_noun(report.frames, 'frame')} rendered, {clock(report.seconds)} min")
+    print(f"{count_noun(report.frames, 'frame')} rendered, {as_clock(report.seconds)} min")
     if is_inside:
         states, steering_tally, judged = map(report.tally, ("hidden_states", "steering", "steering_votes"))
         steered = (

@@ -116,9 +116,9 @@ def _file_of(experiment: str) -> str:
 
 
 def why(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.pipeline.item_answers import explain, lines_of
+    from traps_pipeline.pipeline.item_answers import explain_item, lines_of
 
-    explanation = explain(open_workspace(arguments), arguments.item)
+    explanation = explain_item(open_workspace(arguments), arguments.item)
     if arguments.json:
         print_json(explanation)
         return OK

@@ -4,7 +4,7 @@ import argparse
 import os
 import sys
 
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.cli.command import FAILED, INTERRUPTED, Commands, integer, number, open_workspace
 
 CLUSTER = "of a study on a cluster"
@@ -27,15 +27,15 @@ def add(commands: Commands) -> None:
 
 
 def ui(arguments: argparse.Namespace) -> int:
-    require("ui")
+    require_extra("ui")
     from traps_pipeline.base.keys import optional_key
-    from traps_pipeline.base.process_tree import split
+    from traps_pipeline.base.process_tree import fork_worker
     from traps_pipeline.base.webguard import token_for
     from traps_pipeline.pipeline.webserver import DANGER, STOP_S, TOKEN_VARIABLE, serve_with_dagster
 
     given_token = arguments.token or optional_key(TOKEN_VARIABLE)
     token = token_for(arguments.host, given_token, danger=DANGER, variable=TOKEN_VARIABLE)
-    if (code := split(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
+    if (code := fork_worker(STOP_S + _OWN_S)) is not None:  # before Dagster's imports, which a fork could break
         return code if code >= 0 else FAILED
     print("starting Dagster; the address to open follows", file=sys.stderr)
     from traps_pipeline.pipeline.run import dagster_history

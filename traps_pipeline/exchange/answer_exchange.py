@@ -21,8 +21,8 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_file, write_bytes
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.base.yamlfile import explain, read_lines
-from traps_pipeline.benchmark.held_out import opaque
+from traps_pipeline.base.yamlfile import faults_of, read_lines
+from traps_pipeline.benchmark.held_out import opaque_name
 from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.judging.panel import wanted_ballots
@@ -196,7 +196,7 @@ class AnswerContext:
     def name_of(self, request: Request) -> str:
         """Return an item's name as the file has it: a message about a held-out set may go to its participant."""
         item = str(request.about["item_id"])
-        return opaque(self.key, item) if self.key else item
+        return opaque_name(self.key, item) if self.key else item
 
 
 def import_answers(
@@ -316,7 +316,7 @@ def checked_answers(path: Path, requested: Mapping[str, Request]) -> dict[str, A
         try:
             answer = Answer.model_validate(json.loads(line))
         except ValidationError as error:
-            problems.append(f"{path}:{number}: {explain(error, Answer)}")
+            problems.append(f"{path}:{number}: {faults_of(error, Answer)}")
             continue
         except (ValueError, RecursionError) as error:
             problems.append(f"{path}:{number}: not JSON ({plain(error)[:200]})")
@@ -344,7 +344,7 @@ def _answers_by_item(
         for key, request in requested.items()
         if (subject := request.about)["model"] == model
     }
-    names = {opaque(context.key, item): item for item, _, _ in keys} if context.key else {}
+    names = {opaque_name(context.key, item): item for item, _, _ in keys} if context.key else {}
     answers, problems, failed = dict[str, Answer](), list[str](), set[str]()
     for log_answer in imported:
         run = context.run + log_answer.epoch - 1 if log_answer.run is None else log_answer.run
@@ -360,7 +360,7 @@ def _answers_by_item(
             elif answers.setdefault(key, answer := Answer(key=key, **log_answer.answer)) != answer:
                 problems.append(f"{log_answer.where}: gives another answer to {log_answer.item} than an earlier one")
         except ValidationError as error:
-            problems.append(f"{log_answer.where}: {explain(error)}")
+            problems.append(f"{log_answer.where}: {faults_of(error)}")
         except TypeError as error:
             problems.append(f"{log_answer.where}: {plain(error)[:200]}")
     if problems:

@@ -17,7 +17,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_file
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.yamlfile import read_lines
-from traps_pipeline.checks.loopback import render, replay
+from traps_pipeline.checks.loopback import replay, sent_bodies
 from traps_pipeline.checks.wire_body import Api, WireBody
 from traps_pipeline.exchange.media_references import FOLDER as MEDIA
 from traps_pipeline.exchange.media_references import MediaReferences
@@ -74,7 +74,7 @@ def export_batches(
     for name, (entry, requests) in calls.items():
         part = _Part(folder, name)
         for chunk in _chunks(requests):
-            for request, wire in zip(chunk, render(entry, chunk), strict=True):
+            for request, wire in zip(chunk, sent_bodies(entry, chunk), strict=True):
                 if isinstance(wire, str) or wire.api is None:
                     raise TrapsError(
                         f"{name}: no batch can be made of its calls: {wire if isinstance(wire, str) else wire.path}"

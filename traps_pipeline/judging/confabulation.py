@@ -29,7 +29,7 @@ from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.asking.ask import Call, SettledCell
 from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.registry.judges import JudgeEntry, thinking_of
-from traps_pipeline.models.registry.prompts import prompt
+from traps_pipeline.models.registry.prompts import load_prompt
 from traps_pipeline.models.request import Request
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.datasets import is_ill_posed
@@ -109,7 +109,7 @@ def render(question: str, kind: str, answer: str, trace: str | None) -> str:
 def label_request(judge: JudgeEntry, cell: Cell, item: Mapping[str, Any], answer: str, trace: str | None) -> Request:
     """Return the judge's call about a failure, without model, regime or ground truth."""
     user = render(item["question"], void_kind(cell.dataset), answer, trace)
-    return judge_request(judge, prompt(f"judge_{TASK}"), SCHEMA, vote_subject(TASK, cell, item["item_id"]), user)
+    return judge_request(judge, load_prompt(f"judge_{TASK}"), SCHEMA, vote_subject(TASK, cell, item["item_id"]), user)
 
 
 class Labels(BaseModel):

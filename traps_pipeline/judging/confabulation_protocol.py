@@ -16,7 +16,7 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
 from traps_pipeline.models.registry.entries import NETWORK, get_model
 from traps_pipeline.models.registry.judges import JudgeEntry, load_judges
-from traps_pipeline.models.registry.prompts import prompt
+from traps_pipeline.models.registry.prompts import load_prompt
 from traps_pipeline.models.registry.schemas import structured_output
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
@@ -93,6 +93,8 @@ def protocol_digest(panel: str) -> str:
     """Return the digest of all inputs of a panel's labels except the answers."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
-    call = [judge.id, judge.provider_id, judge.params, SCHEMA, prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
+    call = (
+        [judge.id, judge.provider_id, judge.params, SCHEMA, load_prompt(f"judge_{TASK}"), VOID_KINDS] if judge else None
+    )
     call = [*call, *judge.thinking] if call and judge and judge.thinking else call
     return digest([protocol.model_dump(exclude={"judges"}), call, SAMPLED])[:16]

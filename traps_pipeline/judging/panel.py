@@ -16,11 +16,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, StrictBool, Validat
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.judging.judging_rows import VoteRow
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.asking.answers import answer_request, asked_items
-from traps_pipeline.models.asking.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect
+from traps_pipeline.models.asking.ask import AnyCall, AnyCell, Call, Finished, SettledCell, collect_outcomes
 from traps_pipeline.models.asking.backends import make_backend, make_plugin_backend
 from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.reading.judged_answers import (
@@ -44,7 +44,7 @@ from traps_pipeline.models.registry.judges import (
     vote_prompt,
     vote_schema,
 )
-from traps_pipeline.models.request import JUDGED, WITH_TEXT, Backend, Request
+from traps_pipeline.models.request import JUDGED_OUTCOMES, WITH_TEXT, Backend, Request
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.tables import Table
@@ -77,7 +77,7 @@ def quote(noun: str, name: str, text: str, most: int = MAX_SHOWN) -> str:
     )
 
 
-def render(task: Task, question: str, answer: str, ground_truth: str | None) -> str:
+def vote_text(task: Task, question: str, answer: str, ground_truth: str | None) -> str:
     """Return the user message to a judge."""
     parts = [f"Question: {question}"]
     if task == "correctness":
@@ -109,10 +109,8 @@ def vote_requests(
     judges: Sequence[Judge], task: Task, cell: Cell, item: Mapping[str, Any], answer: str
 ) -> list[Request]:
     """Return each judge's call for one task about one answer, with the same text."""
-    user, subject = (
-        render(task, item["question"], answer, item["ground_truth"]),
-        vote_subject(task, cell, item["item_id"]),
-    )
+    user = vote_text(task, item["question"], answer, item["ground_truth"])
+    subject = vote_subject(task, cell, item["item_id"])
     return [judge_request(judge, vote_prompt(judge, task), vote_schema(judge, task), subject, user) for judge in judges]
 
 
@@ -202,7 +200,7 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
             return "it begins with an object that the answer holds, and goes on in prose"
         judgement = schema.model_validate_json(answer)
     except ValidationError as error:
-        return explain(error)[:200]
+        return faults_of(error)[:200]
     return judgement if read_object(answer) is not None else "a key stands twice"
 
 
@@ -294,8 +292,8 @@ def ask_judges(
     calls: Callable[[AnyCell], Sequence[AnyCall]],
     finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished],
 ) -> Iterator[Finished]:
-    """Call `collect` for judges, with the ledger of votes."""
-    return collect(workspace, stage, workspace.votes, judges, cells, calls, finish, _make_judge)
+    """Call `collect_outcomes` for judges, with the ledger of votes."""
+    return collect_outcomes(workspace, stage, workspace.votes, judges, cells, calls, finish, _make_judge)
 
 
 def _make_judge(entry: Entry) -> Backend:
@@ -333,7 +331,7 @@ def judged_answers(
     """
     items = {item["item_id"]: item for item in asked_items(workspace, cell.dataset)}
     # A steered answer may be cut off.
-    columns, judged = (_ANSWERED, JUDGED) if table is RESPONSES else (None, WITH_TEXT)
+    columns, judged = (_ANSWERED, JUDGED_OUTCOMES) if table is RESPONSES else (None, WITH_TEXT)
     answers = workspace.tables.records(table, cell.partition, columns)
     for answer in islice(answers, start, None if count is None else start + count):
         if answer["outcome"] not in judged:

@@ -171,7 +171,7 @@ def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
     return "broken" if vote is None else "flipped"
 
 
-def summary(rows: pd.DataFrame) -> str:
+def robustness_summary(rows: pd.DataFrame) -> str:
     """Summarize the results by judge as text, then list every vote an attack changed."""
     counts = []
     for judge, votes in rows.groupby("judge", sort=False):

@@ -12,7 +12,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.models.registry.judges import PANEL_SIZES, is_of_rules, panel_id
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.protocol.ratings import (
     ABSTENTION,
@@ -59,7 +59,7 @@ def _decide_group(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.
         chunk = [*group]
         items = tables.read(ITEMS, {"dataset": dataset}, ITEM_COLUMNS)
         responses = pa.concat_tables([tables.arrow(RESPONSES, cell.partition, RESPONSE_COLUMNS) for cell in chunk])
-        rows = decide(items, responses.to_pandas(), pa.concat_tables([votes[cell] for cell in chunk]).to_pandas())
+        rows = verdicts_of(items, responses.to_pandas(), pa.concat_tables([votes[cell] for cell in chunk]).to_pandas())
         # If no answer of a cell is judged, no vote names a panel, so the rows name the study's.
         rows_by_cell = dict([*rows.fillna({"panel": panel_id(workspace.study.panel)}).groupby(CELL)])
         for cell in chunk:
@@ -68,7 +68,7 @@ def _decide_group(workspace: Workspace, cells: Sequence[Cell]) -> dict[Cell, pd.
     return result_by_cell
 
 
-def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
+def verdicts_of(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
     """Return a VERDICTS row per response, from ITEMS, RESPONSES and VOTES rows.
 
     The rows need the columns named above. The panel is that of the cell's votes, null if it has none. The outcome is
@@ -80,7 +80,7 @@ def decide(items: pd.DataFrame, responses: pd.DataFrame, votes: pd.DataFrame) ->
     """
     rows = responses.merge(items, on="item_id", how="left", validate="many_to_one")
     _refuse(rows, rows["scenario_id"].isna().to_numpy(), "item {} is no longer in items", "responses")
-    cast, judged = ratings(votes), rows["outcome"].isin(JUDGED).to_numpy()
+    cast, judged = ratings(votes), rows["outcome"].isin(JUDGED_OUTCOMES).to_numpy()
     is_control = (rows["side"] == "control").to_numpy()
     abstention, has_abstention = cast.on(rows, ABSTENTION)
     correctness, has_correctness = cast.on(rows, CORRECTNESS)

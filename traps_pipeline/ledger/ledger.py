@@ -26,10 +26,10 @@ from traps_pipeline.ledger.rows import (
     digest_of,
     encode_row,
     is_amount,
+    is_settled,
     is_whole,
     participant_of,
     replace_impossible,
-    settles,
 )
 from traps_pipeline.ledger.schema import EVALUATIONS, ROWS, STUDIES, TOTALS
 
@@ -206,7 +206,7 @@ class Ledger:
 
             await self.database.apply(change)
             await asyncio.to_thread(self.database.sync)
-        return sum(settles(row) for _, row, _ in new)
+        return sum(is_settled(row) for _, row, _ in new)
 
     async def _lock(self, evaluation: str, waiting: Waiting, give_up: GiveUp) -> Lock:
         is_told = False

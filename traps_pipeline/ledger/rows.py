@@ -82,7 +82,7 @@ AVERAGED_COLUMNS: dict[str, Callable[[Any], bool]] = {
 }
 
 
-def settles(row: Mapping[str, Any]) -> bool:
+def is_settled(row: Mapping[str, Any]) -> bool:
     """Return whether a row settles its key: a failed call is asked again."""
     return row["outcome"] not in FAILED
 
@@ -135,12 +135,12 @@ class EvaluationRows:
     @property
     def settled(self) -> dict[str, dict[str, Any]]:
         """The rows whose calls need no repetition."""
-        return {key: row for key, row in self.rows.items() if settles(row)}
+        return {key: row for key, row in self.rows.items() if is_settled(row)}
 
     def add(self, row: dict[str, Any]) -> None:
         """Add a row that is newer than all rows so far."""
         previous_row = self.rows.get(row["key"])
-        if previous_row is None or settles(row) or not settles(previous_row):
+        if previous_row is None or is_settled(row) or not is_settled(previous_row):
             self.rows[row["key"]] = row
 
 

@@ -18,10 +18,10 @@ import numpy as np
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, record, require_patchable
+from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, require_patchable, run_pass
 from traps_pipeline.models.local.model import LocalModel
 from traps_pipeline.models.local.prompt_batches import Prompt
-from traps_pipeline.models.local.spans import spans
+from traps_pipeline.models.local.spans import token_spans
 from traps_pipeline.models.local.vision_cache import ClipMemory
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def _zero(subject: Subject) -> str:
 
 def _parts(subject: Subject) -> str:
     prompt, question = subject.prompts[1], QUESTIONS[1]
-    parts, decode = spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
+    parts, decode = token_spans(subject.model, prompt, SYSTEM, question), subject.model.processor.tokenizer.decode
     ids = prompt.inputs["input_ids"][0]
     for name, text in (("system", SYSTEM), ("question", question)):
         decoded_text = "".join(decode(ids[parts[name]]).split())
@@ -168,7 +168,7 @@ def _parts(subject: Subject) -> str:
 
 def _check_pooling(subject: Subject) -> str:
     prompt = subject.prompts[1]
-    positions = spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
+    positions = token_spans(subject.model, prompt, SYSTEM, QUESTIONS[1])["question"]
     pooled_state = subject.model.forward_states(prompt, "question", chosen=positions).raw[subject.layer]
     mean_state = _library_states(subject, prompt)[subject.layer][positions].mean(dim=0).numpy()
     _require(
@@ -201,7 +201,7 @@ def _check_times(subject: Subject) -> str:
 
 def _require_stamps(subject: Subject, slow: Prompt) -> float:
     """Return how far written times are from those of the frames that they stand for, at half the speed."""
-    parts = spans(subject.model, slow, SYSTEM, QUESTIONS[1])
+    parts = token_spans(subject.model, slow, SYSTEM, QUESTIONS[1])
     ids, places = slow.inputs["input_ids"][0], np.flatnonzero(parts["stamps"])
     runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)  # a stamp each, between pictures
     text = " ".join(subject.model.processor.tokenizer.decode(ids[run]) for run in runs)
@@ -226,7 +226,7 @@ def _check_patching(subject: Subject) -> str:
         return f"refused: {str(why).partition(': ')[2].partition(' (')[0]}"
     tokens = abstention_tokens(model)
     other_prompt = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
-    target, source = (record(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
+    target, source = (run_pass(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
     all_tokens = np.ones(target.length, bool)
     full_patches = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]

@@ -25,7 +25,7 @@ from traps_pipeline.mechanism.probing import ProbeRun, Row
 from traps_pipeline.mechanism.stages import confabulations
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry.entries import ModelEntry
-from traps_pipeline.storage.media import MediaSpec, sample
+from traps_pipeline.storage.media import MediaSpec, pick_frames
 from traps_pipeline.storage.tables import records
 from traps_pipeline.storage.workspace import Workspace
 from traps_pipeline.video.encode import DamagedClip
@@ -144,7 +144,7 @@ def _thumbnails(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, fl
     import cv2
 
     try:
-        frames = sample(clip, spec)
+        frames = pick_frames(clip, spec)
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
     thumbnails = [cv2.resize(frame, THUMBNAIL, interpolation=cv2.INTER_AREA) for frame in frames.frames]

@@ -20,7 +20,7 @@ import numpy as np
 
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.files import write_bytes, write_text
 
 VOID = "void"
@@ -155,7 +155,7 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 
     Tensors: kind -> (draws, layers, d), gaps and residual_norms -> (layers,). Raises TrapsError if the disk is full.
     """
-    require("local")
+    require_extra("local")
     from safetensors.numpy import save
 
     tensors = {kind: np.ascontiguousarray(vectors) for kind, vectors in directions.vectors.items()}
@@ -167,7 +167,7 @@ def save_directions(path: Path, directions: Directions, origin: Origin) -> None:
 
 def load_directions(path: Path) -> tuple[Directions, dict[str, Any]]:
     """Return saved directions and the content of their JSON file. Raises TrapsError if one is missing or altered."""
-    require("local")
+    require_extra("local")
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 

@@ -14,7 +14,7 @@ from traps_pipeline.mechanism.mechanism_rows import STEERING, SteeringFluencyRow
 from traps_pipeline.mechanism.sentences import answer_tokens, mean_log_probabilities
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.storage.benchmark_tables import ITEMS
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 
 if TYPE_CHECKING:
     from traps_pipeline.models.registry.entries import ModelEntry
@@ -34,7 +34,7 @@ def fluency_rows(workspace: Workspace, entry: ModelEntry, cell: SteeringCell) ->
     for number, (item_id, group) in enumerate(groups, start=1):
         progress.current().tick("steering_fluency", f"items of {cell.key}", number, len(groups))
         item = items.loc[str(item_id)]
-        frames = sample(workspace.resolve(str(item["clip"])), entry.media)
+        frames = pick_frames(workspace.resolve(str(item["clip"])), entry.media)
         prompt = model.prompt(system, str(item["question"]), frames.frames, frames.times_s)
         tokens = {text: ids for text in dict.fromkeys(group["text"]) if (ids := answer_tokens(model, text))}
         texts, chances = [*tokens], list[float]()

@@ -34,7 +34,7 @@ FittedGate = tuple[Scorer, dict[str, float], dict[str, float]]
 
 
 @dataclass(frozen=True, eq=False)
-class Items:
+class GateItems:
     """Items that a gate is fitted on and applied to.
 
     table: rows with dataset, scenario_id, family, prompt (equal for items with the same prompt) and void (bool).
@@ -46,9 +46,9 @@ class Items:
     features: np.ndarray
     fitted: dict[object, FittedGate] = field(default_factory=dict)
 
-    def rows(self, chosen: np.ndarray) -> Items:
+    def rows(self, chosen: np.ndarray) -> GateItems:
         """Return the items that a boolean mask selects."""
-        return Items(self.table.loc[chosen].reset_index(drop=True), self.features[chosen])
+        return GateItems(self.table.loc[chosen].reset_index(drop=True), self.features[chosen])
 
     @property
     def void(self) -> np.ndarray:
@@ -96,7 +96,7 @@ def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS
     return [name for name in datasets if source in (OTHER_FAMILIES, f"one:{name}")]
 
 
-def decide(items: Items, source: str, target: str, *, folds: int, seed: int, false_abs: float) -> Decisions:
+def gate_answers(items: GateItems, source: str, target: str, *, folds: int, seed: int, false_abs: float) -> Decisions:
     """Return the decisions of a source's gates about every item of a dataset.
 
     A gate is fitted for each fold of the target's scenarios (each family, for `other families`) on source items of all
@@ -118,8 +118,8 @@ def decide(items: Items, source: str, target: str, *, folds: int, seed: int, fal
     return Decisions(target_rows, score, cut, expected)
 
 
-def unseen_scores(items: Items, source: str, target: str, folds: int, seed: int) -> np.ndarray:
-    """Return the log-odds (n,) of a dataset's items by the probes of `decide`, without thresholds."""
+def unseen_scores(items: GateItems, source: str, target: str, folds: int, seed: int) -> np.ndarray:
+    """Return the log-odds (n,) of a dataset's items by the probes of `gate_answers`, without thresholds."""
     target_features = items.features[items.table["dataset"].to_numpy(str) == target]
     score = np.full(len(target_features), np.nan)
     for is_in_fold, is_training in _each_fold(items, source, target, folds, seed):
@@ -129,7 +129,7 @@ def unseen_scores(items: Items, source: str, target: str, folds: int, seed: int)
 
 
 def _each_fold(
-    items: Items, source: str, target: str, folds: int, seed: int
+    items: GateItems, source: str, target: str, folds: int, seed: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield which of a target's items a gate decides, and which items it is fitted on."""
     targets = items.table["dataset"].to_numpy(str)
@@ -144,7 +144,7 @@ def _each_fold(
             yield np.isin(target_groups, fold), is_training
 
 
-def fit_gate(train: Items, folds: int, seed: int, false_abs: float) -> FittedGate:
+def fit_gate(train: GateItems, folds: int, seed: int, false_abs: float) -> FittedGate:
     """Return probe, thresholds, and shares of calibrating controls above each; both sides need two scenarios."""
     probe = fit_probe(train.features, train.void)
     calibration_scores, void = _own_scores(train, folds, seed)
@@ -162,7 +162,7 @@ def _held_out_groups(groups: np.ndarray, source: str, folds: int, seed: int) -> 
     yield from (names[fold == k] for k in range(folds))
 
 
-def _own_scores(train: Items, folds: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _own_scores(train: GateItems, folds: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return held-out scores, by scenario, and labels of the distinct prompts."""
     fold = scenario_folds(train.table["scenario_id"].to_numpy(str), folds, seed)
     score = np.full(len(fold), np.nan)

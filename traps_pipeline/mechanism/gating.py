@@ -18,10 +18,10 @@ from traps_pipeline.mechanism.gate import (
     SOURCES,
     THRESHOLDS,
     Decisions,
-    Items,
+    GateItems,
     Outcomes,
-    decide,
     families,
+    gate_answers,
     separation,
     sources_of_gate,
 )
@@ -35,13 +35,13 @@ from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, draw_scenarios, figures_of, interval, run_sums
+from traps_pipeline.scoring.bootstrap import RESAMPLED_METRICS, draw_scenarios, interval, metrics_of, run_sums
 from traps_pipeline.scoring.metrics import COUNTS
 from traps_pipeline.storage.workspace import Workspace
 
 SHUFFLED = "shuffled labels"
 ALL = "all"
-_PECS = RESAMPLED_FIGURES.index("pecs")
+_PECS = RESAMPLED_METRICS.index("pecs")
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return all items as `gate.Items.table`, in the order of `states.items`."""
+    """Return all items as `gate.GateItems.table`, in the order of `states.items`."""
     items = states.items
     id_columns = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     table = id_columns.assign(family=families(items), prompt=items["states_key"])
@@ -139,13 +139,13 @@ def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates) -> Gated
         if not sources_of_gate(source, str(target), datasets):
             continue  # a study without all datasets has fewer gates
         layer = gates.layers.get(str(target), -1)
-        decision = decide(items_of[layer], source, str(target), **settings_of_gate)
+        decision = gate_answers(items_of[layer], source, str(target), **settings_of_gate)
         if np.isfinite(decision.score).any():
             decisions[source, str(target)] = decision, layer
     return decisions
 
 
-def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> Items:
+def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> GateItems:
     """Return the table with features; if shuffled, scenarios swap sides at random."""
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
     for name, rows in features.items():
@@ -153,7 +153,7 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
     if shuffled:
         void = swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
         table = table.assign(void=void)
-    return Items(table, values)
+    return GateItems(table, values)
 
 
 def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
@@ -206,9 +206,9 @@ def _rows(
             about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
                 sums = _resample(gated_outcomes, target, names[decisions.place], resamples, seed)
-                about_pecs = interval(figures_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
+                about_pecs = interval(metrics_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
                 dataset_figures.append(values)
-                draws.append(figures_of(sums, in_mean=True)[:, _PECS, 1:])
+                draws.append(metrics_of(sums, in_mean=True)[:, _PECS, 1:])
             area = separation(decisions, outcome.void)
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))

@@ -32,9 +32,9 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.models.local.capture import OF_PAIRS, OF_PARTS, ONE_TOKEN, Pooling
-from traps_pipeline.models.local.spans import changed_tokens, spans
+from traps_pipeline.models.local.spans import changed_tokens, token_spans
 from traps_pipeline.storage.leases import hold_lease, leased_ranges
-from traps_pipeline.storage.media import MediaSpec, profile_digest, sample
+from traps_pipeline.storage.media import MediaSpec, pick_frames, profile_digest
 from traps_pipeline.storage.parquet import read_sealed, write_sealed
 from traps_pipeline.storage.store import FolderStore
 
@@ -83,7 +83,7 @@ def clip_item(
     """
 
     def asked(frames_of: Path) -> Prompt:
-        frames = sample(frames_of, spec)
+        frames = pick_frames(frames_of, spec)
         return model.prompt(system, row["question"], frames.frames, frames.times_s)
 
     key_parts = {
@@ -208,7 +208,7 @@ def _pooled_tokens(model: LocalModel, prompt: Prompt, item: Item, pooling: Pooli
     """Return the tokens over which states are pooled, or None if there is no mask."""
     if pooling not in OF_PARTS:
         return None
-    parts = spans(model, prompt, item.about["system"], item.about["question"])
+    parts = token_spans(model, prompt, item.about["system"], item.about["question"])
     positions = parts[pooling] if pooling not in OF_PAIRS else _pair_masks(parts["visual"], prompt, item)[pooling]
     if not positions.any():
         raise TrapsError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from traps_pipeline.mechanism.baselines import MARGIN, output_or_note
 from traps_pipeline.mechanism.control_rows import ItemScoreRow
-from traps_pipeline.mechanism.gate import MID, OTHER_DATASETS, decide, sources_of_gate
+from traps_pipeline.mechanism.gate import MID, OTHER_DATASETS, gate_answers, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table, outcomes_of, read_states
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.registry.entries import ModelEntry
@@ -34,7 +34,7 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
         items = gate_items(table, features, shuffled=False, seed=settings.seed)
         for name, source in (("own", f"one:{dataset}"), ("others", OTHER_DATASETS)):
             if sources_of_gate(source, dataset, datasets):
-                decision = decide(items, source, dataset, **probe_settings)
+                decision = gate_answers(items, source, dataset, **probe_settings)
                 scores[name] = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {

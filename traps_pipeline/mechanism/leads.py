@@ -15,7 +15,7 @@ import pandas as pd
 from traps_pipeline.base import progress
 from traps_pipeline.mechanism.baselines import MARGIN, RAW, Features, output_or_note, probed_items, raw_features
 from traps_pipeline.mechanism.control_rows import MODEL, RESIDUAL, STATES, LeadRow
-from traps_pipeline.mechanism.gate import OTHER_DATASETS, Items, sources_of_gate, unseen_scores
+from traps_pipeline.mechanism.gate import OTHER_DATASETS, GateItems, sources_of_gate, unseen_scores
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import auroc, auroc_draws, auroc_interval
 from traps_pipeline.mechanism.stored_states import StoredStates
@@ -115,7 +115,7 @@ def _target_rows(
     scores = {
         name: values[mask][is_target, 0]
         if name == MARGIN
-        else unseen_scores(Items(table, values[mask]), OTHER_DATASETS, target, settings.probes.folds, settings.seed)
+        else unseen_scores(GateItems(table, values[mask]), OTHER_DATASETS, target, settings.probes.folds, settings.seed)
         for name, values in features.items()
     }
     areas = {name: float(auroc(void, values)) for name, values in scores.items()}

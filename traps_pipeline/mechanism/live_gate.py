@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
-from traps_pipeline.mechanism.gate import THRESHOLDS, Items, fit_gate, sources_of_gate
+from traps_pipeline.mechanism.gate import THRESHOLDS, GateItems, fit_gate, sources_of_gate
 from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_table
 from traps_pipeline.mechanism.probes import Scorer
 from traps_pipeline.mechanism.stored_states import StoredStates
@@ -106,7 +106,7 @@ def gate(
     return Gate(layer, probe, cuts[threshold], pooling)  # pyright: ignore[reportArgumentType]
 
 
-def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> Items:
+def _train(states: StoredStates, source: str, target: str, layer: int, without: Collection[str]) -> GateItems:
     table = gate_table(states)
     datasets = [name for name in DATASETS if name in set(table["dataset"])]
     names = sources_of_gate(source, target, datasets)

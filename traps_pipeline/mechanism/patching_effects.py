@@ -44,7 +44,7 @@ from traps_pipeline.models.local.sidepaths import (
     PER_LAYER,
     SHARED_KEYS,
     argument_of,
-    unknown_path,
+    unknown_side_path,
     with_argument,
 )
 from traps_pipeline.models.local.spans import visual_tokens
@@ -99,7 +99,7 @@ class RecordedPass:
 
 def require_patchable(model: LocalModel) -> None:
     """Raise TrapsError if later blocks read more of earlier ones than is replaced."""
-    unknown = unknown_path(model.network.config.get_text_config(), model.blocks[0])
+    unknown = unknown_side_path(model.network.config.get_text_config(), model.blocks[0])
     if unknown:
         raise TrapsError(
             f"{model.checkpoint.name}: {unknown}, which patching does not replace, so that its effects would be too "
@@ -123,7 +123,7 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
             yield site, layer, part
 
 
-def record(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
+def run_pass(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
     """Run one pass; keep states of `sites` and of the residual stream for patches.
 
     tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.

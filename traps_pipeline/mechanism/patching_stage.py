@@ -32,17 +32,17 @@ from traps_pipeline.mechanism.patching_effects import (
     RecordedPass,
     attributed_changes,
     patched_changes,
-    record,
     require_patchable,
+    run_pass,
 )
 from traps_pipeline.mechanism.probing_versions import extraction_version
-from traps_pipeline.models.local.spans import changed_tokens, spans
+from traps_pipeline.models.local.spans import changed_tokens, token_spans
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.datasets import SIDES
 from traps_pipeline.scoring.bootstrap import TAXONOMIES, draw_scenarios, interval, shares_of, with_unseen
-from traps_pipeline.storage.media import Frames, MediaSpec, sample
+from traps_pipeline.storage.media import Frames, MediaSpec, pick_frames
 from traps_pipeline.storage.study import PatchingSettings
 from traps_pipeline.storage.workspace import Workspace
 
@@ -157,7 +157,7 @@ class Pairs:
                 if side == patched_side and groups[group].any()
             ]
             patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
-            target_pass, source_margin = record(self._model, target.prompt, self._tokens, ()), 0.0
+            target_pass, source_margin = run_pass(self._model, target.prompt, self._tokens, ()), 0.0
             for kind in SOURCES:
                 side = self._source(name, patched_side, kind)
                 if side is None:
@@ -172,15 +172,15 @@ class Pairs:
 
     def _attribute(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
         """Return both sides' margins and each token's estimate; free the states."""
-        target_pass = record(self._model, target.prompt, self._tokens, ())
-        source_pass = record(self._model, source.prompt, self._tokens, self._settings.sites)
+        target_pass = run_pass(self._model, target.prompt, self._tokens, ())
+        source_pass = run_pass(self._model, source.prompt, self._tokens, self._settings.sites)
         return (target_pass.margin, source_pass.margin), attributed_changes(
             self._model, target_pass, source_pass, self._tokens
         )
 
     def _patch(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return a source's margin, and the changes by its patches; free its states."""
-        source = record(self._model, side.prompt, self._tokens, self._settings.sites)
+        source = run_pass(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
@@ -215,10 +215,10 @@ class Pairs:
         row = self._items[name, which]
         clip, question = self._workspace.resolve(row["clip"]), str(row["question"])
         other_clip = self._workspace.resolve(self._items[name, times_of]["clip"]) if times_of else None
-        frames = sample(clip, self._spec)
+        frames = pick_frames(clip, self._spec)
         times = shown_times(frames, clip, self._spec, other_clip)
         prompt = self._model.prompt(self._system, question, frames.frames, times)
-        side = Side(prompt, spans(self._model, prompt, self._system, question))
+        side = Side(prompt, token_spans(self._model, prompt, self._system, question))
         self._parts[name, which, times_of] = side.parts
         return side
 
@@ -347,7 +347,7 @@ def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) 
     """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
     if times is None or times == clip:
         return shown.times_s
-    sampled_s = sample(times, spec).times_s
+    sampled_s = pick_frames(times, spec).times_s
     if len(sampled_s) == len(shown.times_s):
         return sampled_s
     return np.interp(np.linspace(0, 1, len(shown.times_s)), np.linspace(0, 1, len(sampled_s)), sampled_s)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.models.local.backend import LocalBackend, outcome
+from traps_pipeline.models.local.backend import LocalBackend, local_outcome
 from traps_pipeline.models.registry.entries import Entry
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.storage.media import sample
+from traps_pipeline.storage.media import pick_frames
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import Prompt
@@ -58,7 +58,7 @@ class SteeredBackend(LocalBackend):
                 answers = model.generate(prompts, max_tokens, None, hook, stopped=stopped)
             for number, answer in zip(numbers, answers, strict=True):
                 counts = (answer.prompt_tokens, answer.completion_tokens)
-                outcomes[number] = outcome(answer.text, answer.finish_reason, *counts, model.served_model)
+                outcomes[number] = local_outcome(answer.text, answer.finish_reason, *counts, model.served_model)
         return [outcomes[number] for number in range(len(batch))]
 
     def _model(self) -> Any:
@@ -68,7 +68,7 @@ class SteeredBackend(LocalBackend):
 
     def _make_prompt(self, clip: Any, digest: str, system: str, user: str) -> Prompt:
         """Return a processed prompt, cached in memory; `digest` identifies the frames."""
-        frames = sample(clip, self._spec)
+        frames = pick_frames(clip, self._spec)
         return self._model().prompt(system, user, frames.frames, frames.times_s.tolist())
 
 

@@ -27,7 +27,7 @@ from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.mechanism.transfer_paths import sources_of
 from traps_pipeline.models.asking.answers import Question
-from traps_pipeline.models.asking.ask import SettledCell, collect
+from traps_pipeline.models.asking.ask import SettledCell, collect_outcomes
 from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.registry.entries import Entry, ModelEntry
 from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
@@ -289,7 +289,7 @@ def collect_steered(
     def make(entry: Entry) -> SteeredBackend:
         return SteeredBackend(entry, vectors)
 
-    yield from collect(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
+    yield from collect_outcomes(workspace, "steering", workspace.answers, [entry], cells, calls, finish, make)
 
 
 def _steering_row(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 OutcomeKind = Literal["answer", "truncated", "unfinished", "empty", "refused", "error", "malformed"]
 WITH_TEXT: tuple[OutcomeKind, ...] = ("answer", "truncated")  # docs/models.md, "Request -> Outcome"
-JUDGED: tuple[str, ...] = ("answer",)  # outcomes of `models.reading.interpret` that judges see
+JUDGED_OUTCOMES: tuple[str, ...] = ("answer",)  # outcomes of `models.reading.interpret` that judges see
 UNFINISHED = "unfinished"  # unknown finish reason: no answer, whatever its text says
 RATE_LIMITED = "rate_limited"  # the kind of a 429
 UNREACHABLE = "unreachable"  # the kind of a call that was never sent: no byte of it reached a server

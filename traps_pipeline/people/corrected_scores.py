@@ -15,17 +15,17 @@ import pandas as pd
 from traps_pipeline.people.human_score_rows import CORRECTED, PANEL_ERRORS
 from traps_pipeline.people.human_scores import stratum_weights, with_intervals
 from traps_pipeline.people.label_units import ABOUT_ANSWERS, TaskName
-from traps_pipeline.people.labels import truths
+from traps_pipeline.people.labels import true_labels
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED_FIGURES,
+    RESAMPLED_METRICS,
     RESAMPLES,
     SEED,
     Resampling,
     draw_scenarios,
-    figures_of,
     figures_of_shares,
     means_over_runs,
+    metrics_of,
     resampled_sums,
     run_sums,
     shares_of,
@@ -105,7 +105,7 @@ def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
     """Return sensitivity and specificity by task and draw; NaN without yes, or no."""
     errors: dict[TaskName, np.ndarray] = {}
     for task in ABOUT_ANSWERS:
-        answers = truths(labels, task).dropna(subset=["truth"])
+        answers = true_labels(labels, task).dropna(subset=["truth"])
         if answers.empty:
             continue
         truth, panel = answers["truth"].to_numpy(bool), answers["panel"].to_numpy(bool)
@@ -127,7 +127,7 @@ def _errors(labels: pd.DataFrame, resampling: Resampling) -> Errors:
 
 
 def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: str) -> dict[str, Any]:
-    answers = truths(labels, task)
+    answers = true_labels(labels, task)
     decided_answers = answers.dropna(subset=["truth"])
     n_yes = int(decided_answers["truth"].to_numpy(bool).sum())
     if n_yes in (0, len(decided_answers)):
@@ -155,11 +155,11 @@ def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Erro
         return figures_of_shares(np.stack(fixed, axis=1))
 
     sums = run_sums(group, resampling, named)
-    means = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (figures_of, right)]
+    means = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (metrics_of, right)]
     return {
         dataset: {
-            **with_intervals(RESAMPLED_FIGURES, figures),
-            **with_intervals(RESAMPLED_FIGURES, means[1][dataset], "_corrected"),
+            **with_intervals(RESAMPLED_METRICS, figures),
+            **with_intervals(RESAMPLED_METRICS, means[1][dataset], "_corrected"),
         }
         for dataset, figures in means[0].items()
         if not np.isnan(figures[:, :, 0]).all()

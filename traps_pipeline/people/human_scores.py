@@ -11,16 +11,16 @@ import numpy as np
 import pandas as pd
 
 from traps_pipeline.people.human_score_rows import HUMAN_ROW
-from traps_pipeline.people.labels import agreement_of, matrix
+from traps_pipeline.people.labels import agreement_of, label_matrix
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED_FIGURES,
+    RESAMPLED_METRICS,
     RESAMPLES,
     SEED,
     draw_scenarios,
-    figures_of,
     limits_of,
     means_over_runs,
+    metrics_of,
     run_sums,
     with_interval,
 )
@@ -45,20 +45,20 @@ def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
     items = pd.concat([clips[["dataset", "scenario_id"]].assign(run=1), counts[COUNTS]], axis=1)
     items["taxonomy"] = items["dataset"].map(taxonomy_of)
     resampling = draw_scenarios(items, resamples, seed)
-    means = means_over_runs(run_sums(items, resampling, "people"), figures_of, resamples + 1)
+    means = means_over_runs(run_sums(items, resampling, "people"), metrics_of, resamples + 1)
     clips_of = {name: clips if name == "overall" else clips.loc[clips["dataset"] == name] for name in means}
     rows = [_row(dataset, figures, clips_of[dataset]) for dataset, figures in means.items()]
     return pd.DataFrame(rows, columns=pd.Index(HUMAN_ROW.names))
 
 
 def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, Any]:
-    _, agreement, alpha = agreement_of(matrix(clips, "abstained"))
+    _, agreement, alpha = agreement_of(label_matrix(clips, "abstained"))
     return {
         "dataset": dataset,
         "n_people": clips["annotator"].nunique(),
         "n_labels": len(clips),
         "n_clips": clips["unit"].nunique(),
-        **with_intervals(RESAMPLED_FIGURES, figures),
+        **with_intervals(RESAMPLED_METRICS, figures),
         "agreement": agreement,
         "alpha": alpha,
         "seconds": float(np.median(clips["seconds"].to_numpy(float))),

@@ -176,7 +176,7 @@ def _refuse(wrong: Sequence[str]) -> None:
 # --- the comparison ---------------------------------------------------------------------------------------------------
 
 
-def validate(workspace: Workspace, path: Path) -> pd.DataFrame:
+def validation_rows(workspace: Workspace, path: Path) -> pd.DataFrame:
     """Write and return JUDGE_VALIDATION rows from a label file. Raises TrapsError."""
     judged = _judged_failures(workspace).set_index("sample_id")
     if judged.empty:

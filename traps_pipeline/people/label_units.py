@@ -66,7 +66,7 @@ def annotation_protocol(path: Path = PROTOCOL_FILE) -> AnnotationProtocol:
     return parse_yaml_model(AnnotationProtocol, read_yaml(path), path)
 
 
-def units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
+def label_units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     """Return UNIT_COLUMNS of all units of a task in the study; may be empty.
 
     panel is the panel's decision (null except in ABOUT_ANSWERS); model, regime and run are null for clips.
@@ -137,7 +137,7 @@ def _unit(*shown: str) -> str:
 
 def sample(workspace: Workspace, task: TaskName) -> pd.DataFrame:
     """Return the units sampled for people (`draw_sample`, or the sheet's failures)."""
-    population = units(workspace, task)
+    population = label_units(workspace, task)
     if population.empty:
         return population
     if task == "confabulation":

@@ -16,11 +16,11 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, create_model
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.models.reading.judged_answers import is_correct
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
-from traps_pipeline.people.label_units import ABOUT_ANSWERS, TASKS, TaskName, strata, units
+from traps_pipeline.people.label_units import ABOUT_ANSWERS, TASKS, TaskName, label_units, strata
 from traps_pipeline.protocol.ratings import AXES, INVALID, NO, YES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
@@ -83,7 +83,7 @@ def label_lines(folder: Path) -> list[Line]:
             label = Line.model_validate_json(line.content)
             LABELS[label.task].model_validate(label.label)
         except ValidationError as error:
-            raise TrapsError(f"{path}:{line.number}: {explain(error)}") from error
+            raise TrapsError(f"{path}:{line.number}: {faults_of(error)}") from error
         lines.append(label)
     return lines
 
@@ -102,7 +102,7 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
     for task in TASKS if len(latest) else ():
         labels = latest.loc[latest["task"] == task]
         if len(labels):
-            population = units(workspace, task)
+            population = label_units(workspace, task)
             population["stratum"] = strata(population)
             population["stratum_size"] = population.groupby("stratum")["unit"].transform("size")
             frames.append(labels.merge(population, on="unit", how="inner", validate="many_to_one"))
@@ -145,7 +145,7 @@ def human_agreement(labels: pd.DataFrame) -> pd.DataFrame:
 
 
 def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str, Any]:
-    values = matrix(labels, decision)
+    values = label_matrix(labels, decision)
     n_shared, equal_share, alpha = agreement_of(values)
     reason = "every label is the same" if n_shared else "nothing was labelled by two people"
     return {
@@ -163,7 +163,7 @@ def _agreement(task: TaskName, decision: str, labels: pd.DataFrame) -> dict[str,
 
 
 def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
-    """Return the agreement between labels in the form of `matrix`; NaN if undefined.
+    """Return the agreement between labels in the form of `label_matrix`; NaN if undefined.
 
     Three values: the number of units with two people or more, the share of equal pairs of labels of the same unit, and
     Krippendorff's alpha.
@@ -177,7 +177,7 @@ def agreement_of(values: np.ndarray) -> tuple[int, float, float]:
     return n_shared_units, equal_share, krippendorff_alpha(values) if n_shared_units else float("nan")
 
 
-def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
+def label_matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
     """Return labels as YES, NO, INVALID (unlabelled): (units, people) int8, sorted."""
     names, people = (sorted(labels[column].unique()) for column in ("unit", "annotator"))
     values = np.full((len(names), len(people)), INVALID, np.int8)
@@ -189,7 +189,7 @@ def matrix(labels: pd.DataFrame, decision: str) -> np.ndarray:
     return values
 
 
-def truths(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
+def true_labels(labels: pd.DataFrame, task: TaskName) -> pd.DataFrame:
     """Return the majority about each unit of ABOUT_ANSWERS in columns of HUMAN_LABELS, with `truth` (null: a tie)."""
     if task not in ABOUT_ANSWERS:
         raise ValueError(f"{task}: the panel decides nothing of the kind")

@@ -21,14 +21,14 @@ from traps_pipeline.benchmark.records import load_released, released_lines, two_
 from traps_pipeline.judging.confabulation_protocol import load_protocol
 from traps_pipeline.models.registry.entries import load_accounts, load_models
 from traps_pipeline.models.registry.judges import load_judges, load_panel
-from traps_pipeline.models.registry.prompts import prompt, system_prompt, vqa_prompt
+from traps_pipeline.models.registry.prompts import load_prompt, system_prompt, vqa_prompt
 from traps_pipeline.pipeline.assets import WorkspaceResource
 from traps_pipeline.pipeline.graph import JOB_GROUPS, Stage, name_of, the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.machine import require_machine
 from traps_pipeline.pipeline.metadata import errors_for_pages, page_text, visible_metadata
 from traps_pipeline.pipeline.partition_checks import CURRENT
-from traps_pipeline.pipeline.ranges import batches
+from traps_pipeline.pipeline.ranges import key_ranges
 from traps_pipeline.pipeline.run import materialize_stale
 from traps_pipeline.pipeline.run_plan import RunPlan
 from traps_pipeline.pipeline.runs import LocalRuns, range_tags, report_canceling
@@ -61,7 +61,7 @@ def reread_sources() -> None:
     """
     registries = (load_models, load_accounts, load_judges, load_panel, load_protocol)
     benchmark = (load_released, released_lines, two_events_lines, corrected_scenarios, corrected_two_events)
-    for reader in (*benchmark, prompt, system_prompt, vqa_prompt, *registries):
+    for reader in (*benchmark, load_prompt, system_prompt, vqa_prompt, *registries):
         reader.cache_clear()
 
 
@@ -161,7 +161,7 @@ def _requests(instance: dg.DagsterInstance, plan: RunPlan) -> list[dg.RunRequest
         nodes = [(stage.name, key) for stage in stages for key in keys]
         # Try each outdated partition once per set of inputs: if it stays outdated, it fails for its own reasons.
         states = [[name_of(node), plan.lineage.made_at(*node), plan.lineage.inputs(*node)] for node in nodes]
-        for batch in batches(block[0].scheme, keys):
+        for batch in key_ranges(block[0].scheme, keys):
             requests.append(
                 dg.RunRequest(
                     digest([*batch, states])[:32],

@@ -10,9 +10,9 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.suggestions import did_you_mean, nearest
+from traps_pipeline.base.suggestions import did_you_mean, nearest_name
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
-from traps_pipeline.benchmark.corrections import corrected_scenarios, current_benchmark, subset
+from traps_pipeline.benchmark.corrections import corrected_scenarios, current_benchmark, of_study
 from traps_pipeline.benchmark.records import refuse_recorded
 from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
 from traps_pipeline.models.registry.judges import load_panel, load_panels, require_panel
@@ -174,10 +174,10 @@ def load_experiment(name: str) -> Experiment:
         for model in experiment.models:
             get_model(model)
         for panel in (*experiment.own.panels, experiment.panel or ""):
-            if nearest(panel, load_panels()):  # another one may be the workspace's own
+            if nearest_name(panel, load_panels()):  # another one may be the workspace's own
                 load_panel(panel)
         if experiment.scenarios is not None and experiment.benchmark == current_benchmark():
-            subset(corrected_scenarios(), experiment.study)
+            of_study(corrected_scenarios(), experiment.study)
         if physical := [
             *(model for model in experiment.models if get_model(model).backend in ("observer", "rule")),
             *(dataset for dataset in experiment.datasets if dataset in UNPAIRED and dataset != TWO_EVENTS),

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.models.asking.backends import require_libraries
 from traps_pipeline.models.money.spending import open_budget
 from traps_pipeline.models.registry.entries import NETWORK, Entry
@@ -54,7 +54,7 @@ def run_experiment(
         for entry in entries:
             require_libraries(entry)
         if experiment.mechanism is not None and "hidden_states" in plan.parts:
-            require("local")
+            require_extra("local")
         if look_at_machine:
             require_machine(plan)
         if any(entry.prices for entry in entries):  # from the first line on

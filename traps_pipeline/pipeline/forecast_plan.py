@@ -20,7 +20,7 @@ from traps_pipeline.models.asking.answers import answer_request, asked_items, is
 from traps_pipeline.models.money.forecast import Experience, Forecast, experience, forecast, minutes_of
 from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, get_model
 from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.pipeline.experiment import Experiment
 from traps_pipeline.pipeline.graph import Node
 from traps_pipeline.pipeline.lineage import Lineage
@@ -271,7 +271,7 @@ def _count_cell(
             n_new += len(panel) * len(tasks)
             continue
         answer = response_row(cell, item, row, traces.get(row["key"]))
-        if answer.outcome in JUDGED and answer.text is not None:
+        if answer.outcome in JUDGED_OUTCOMES and answer.text is not None:
             for task in tasks:
                 ballots |= {request.key for request in vote_requests(panel, task, cell, item, answer.text)}
     answers.add(len({*keys.values()}) + len(items) - len(keys), len(rows))

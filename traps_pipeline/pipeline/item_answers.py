@@ -22,7 +22,7 @@ _OF_ANSWER = ("item_id", "text", "fragment", "error", "outcome")
 _OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "rationale", "invalid_reason")
 
 
-def explain(workspace: Workspace, item_id: str) -> dict[str, Any]:
+def explain_item(workspace: Workspace, item_id: str) -> dict[str, Any]:
     """Return an item's question, clip if it is current, and the state of its answers.
 
     For every evaluation that has asked it: whether its answer is valid or which component of the key changed, with the

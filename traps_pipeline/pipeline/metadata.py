@@ -10,7 +10,7 @@ import dagster as dg
 
 from traps_pipeline.base.paths import ROOT
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.base.terminal import visible
+from traps_pipeline.base.terminal import escape_invisible
 from traps_pipeline.pipeline.graph import Stage
 from traps_pipeline.pipeline.previews import Markdown, Records, StudyFile
 from traps_pipeline.storage.parquet import StageOutput
@@ -31,7 +31,7 @@ def page_text(text: str) -> str:
     for folder, prefix in ((root, ""), (ROOT, ""), (Path.home(), "~/")):
         if folder != folder.parent:  # the home of a container's user may be /
             text = text.replace(f"{folder}/", prefix).replace(str(folder), folder.name)
-    return visible(text)
+    return escape_invisible(text)
 
 
 @contextmanager

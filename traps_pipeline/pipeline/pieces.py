@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.archives import pack, unpack
+from traps_pipeline.base.archives import unzip_bytes, zip_bytes
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import user_cache
@@ -104,13 +104,13 @@ class _SharedPieces:
 
 
 def _archive(inputs: Mapping[str, Digests], contents: Mapping[str, bytes]) -> bytes:
-    return pack({NOTES: json.dumps(inputs).encode(), **contents}, level=1)
+    return zip_bytes({NOTES: json.dumps(inputs).encode(), **contents}, level=1)
 
 
 def _read(data: bytes) -> dict[str, tuple[Digests, bytes]]:
     """Return the digests and content of each piece; empty if the archive is damaged, or of an earlier version."""
     try:
-        members = unpack(data)
+        members = unzip_bytes(data)
         inputs = json.loads(members[NOTES]).items()
         return {name: ((str(versions), str(inputs)), members[name]) for name, (versions, inputs) in inputs}
     except (ValueError, KeyError, TypeError, AttributeError):

@@ -42,7 +42,7 @@ class _Grid:
         return "|".join(filter(None, first)), "|".join(filter(None, last))
 
 
-def batches(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator[Range]:
+def key_ranges(scheme: Partitioning | None, keys: Sequence[str | None]) -> Iterator[Range]:
     """Yield the fewest ranges that together contain exactly the keys."""
     if scheme is None or not keys:
         yield from ((key, key) for key in keys)
@@ -67,7 +67,7 @@ def _spans(numbers: Sequence[int]) -> list[tuple[int, int]]:
     return spans
 
 
-def cut(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
+def cut_keys(scheme: Partitioning | None, keys: Sequence[str | None], most: int) -> list[Range]:
     """Return up to `most` ranges of about equally many keys, none twice.
 
     A range may contain other keys. Cells of one model stay together if there are fewer runs than models, since each run
@@ -132,7 +132,7 @@ def shared_out(
     """
     count = max(1, min(most, int(sum(seconds.values()) / WORTH_S)))
     if scheme is None or count <= len(keys):
-        return cut(scheme, keys, 1) * count
+        return cut_keys(scheme, keys, 1) * count
     runs = dict.fromkeys(keys, 1)
     for _ in range(count - len(keys)):
         busiest_key = max(keys, key=lambda key: seconds[key] / runs[key])

@@ -20,7 +20,7 @@ from typing_extensions import override
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.money.budget import BudgetReached
 from traps_pipeline.pipeline.graph import Stage
-from traps_pipeline.pipeline.ranges import Range, batches
+from traps_pipeline.pipeline.ranges import Range, key_ranges
 from traps_pipeline.pipeline.translation import asset_key
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
@@ -74,7 +74,7 @@ class LocalRuns(Runs):
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:
         """Return the fewest ranges of keys that contain exactly these keys."""
-        return [*batches(stages[0].scheme if stages else None, keys)]
+        return [*key_ranges(stages[0].scheme if stages else None, keys)]
 
     @override
     def make(self, stages: Sequence[Stage], ranges: Sequence[Range], tags: Mapping[str, str]) -> Iterator[RunOutcome]:

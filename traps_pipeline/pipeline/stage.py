@@ -53,7 +53,7 @@ def is_declared(name: str) -> bool:
     return name in DECLARED
 
 
-def of(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: UpstreamPolicy = "every") -> Parent:
+def dep(parent: Stage | Source | str, mapping: KeyMapping | None = None, *, need: UpstreamPolicy = "every") -> Parent:
     """Return a stage's dependency on a parent, with its mapping and what it needs."""
     return Parent(parent if isinstance(parent, str) else parent.name, mapping, need)
 
@@ -100,7 +100,7 @@ def stage(
             output = function(workspace, key)
             return output if isinstance(output, StageOutput) or isinstance(table, str) else _with_preview(table, output)
 
-        upstream = [parent if isinstance(parent, Parent) else of(parent) for parent in parents]
+        upstream = [parent if isinstance(parent, Parent) else dep(parent) for parent in parents]
         declaration = Stage(
             name=table if isinstance(table, str) else table.name,
             table=None if isinstance(table, str) else table,

@@ -22,7 +22,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_text
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.workers import keep_workers
-from traps_pipeline.base.yamlfile import explain, read_lines
+from traps_pipeline.base.yamlfile import faults_of, read_lines
 from traps_pipeline.benchmark.held_out import require_secret_seed
 from traps_pipeline.benchmark.records import load_release, load_released, parse_record, refuse_recorded
 from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
@@ -128,7 +128,7 @@ def _read(kind: type[Any], path: Path) -> Any:
     try:
         return kind.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        raise TrapsError(f"{path}: is no {kind.__name__.lower()} ({explain(error)}); get the file again") from error
+        raise TrapsError(f"{path}: is no {kind.__name__.lower()} ({faults_of(error)}); get the file again") from error
     except OSError as error:
         raise TrapsError(
             f"{path}: cannot be read ({error.strerror}); name a file of `traps benchmark commit`"

@@ -12,12 +12,12 @@ from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import read_yaml
 from traps_pipeline.benchmark.corrections import load_two_events
-from traps_pipeline.benchmark.held_out import opaque
+from traps_pipeline.benchmark.held_out import opaque_name
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
 from traps_pipeline.benchmark.stored_evidence import judged_certificates
 from traps_pipeline.judging.panel import tasks_for
-from traps_pipeline.models.registry.prompts import prompt, system_prompt
+from traps_pipeline.models.registry.prompts import load_prompt, system_prompt
 from traps_pipeline.people.recorded_certificates import recorded_verdicts
 from traps_pipeline.pipeline.experiment import LITE_FILE
 from traps_pipeline.protocol.datasets import ARMS, DATASETS, TWO_EVENTS
@@ -166,7 +166,7 @@ def held_out_rows(items: Rows, digests: Mapping[str, str], key: bytes, canary: s
     """Return one row per item, sorted by opaque name; no field reveals the answer. digests: of each item's own clip."""
     rows = [
         HeldOutItemRow(
-            item=opaque(key, row["item_id"]),
+            item=opaque_name(key, row["item_id"]),
             question=row["question"],
             file_name=f"items/{clip_name(digests[row['item_id']])}",
             media_digest=digests[row["item_id"]],
@@ -238,8 +238,8 @@ def split_rows(content: Content) -> list[SplitRow]:
 
 def prompt_rows(canary: str) -> list[PromptRow]:
     """Return one row per system prompt: of each regime, and of each task of the panel."""
-    texts = {(JUDGE, task): prompt(f"judge_{task}") for task in tasks_for("control")}
-    texts[JUDGE, "premise"] = prompt("judge_premise_suffix")
+    texts = {(JUDGE, task): load_prompt(f"judge_{task}") for task in tasks_for("control")}
+    texts[JUDGE, "premise"] = load_prompt("judge_premise_suffix")
     texts |= {(SYSTEM, regime): system_prompt(regime) for regime in REGIMES}
     return [
         PromptRow(name=name, role=role, text=text, version=digest(text)[:16], licence=PROMPT_LICENCE, canary=canary)

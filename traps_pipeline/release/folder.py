@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.held_out import (
     drawn_items,
     held_out_key,
     mark_held_out,
-    opaque,
+    opaque_name,
     require_secret_seed,
 )
 from traps_pipeline.release import content as rows_of
@@ -159,7 +159,7 @@ def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path
     mark_held_out(content.study, items)
     digests = write_held_out_clips(items, content.clips, key, folder.root / CLIPS / "items")
     folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(items, digests, key, content.release.canary))
-    names = sorted((opaque(key, row["item_id"]), row["item_id"]) for row in items)
+    names = sorted((opaque_name(key, row["item_id"]), row["item_id"]) for row in items)
     answers = key_file.with_name(f"{key_file.name}.items.jsonl")
     lines = "".join(json.dumps({"item": n, "item_id": id_}) + "\n" for n, id_ in names)
     if answers.exists() and answers.read_text(encoding="utf-8") != lines:

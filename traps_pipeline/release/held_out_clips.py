@@ -15,7 +15,7 @@ import numpy as np
 
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.digests import file_digest
-from traps_pipeline.benchmark.held_out import opaque
+from traps_pipeline.benchmark.held_out import opaque_name
 from traps_pipeline.video.encode import decode, encode
 
 _BOX = struct.Struct(">I4s")  # size and type of a box of an mp4; players skip one of type `free`
@@ -31,7 +31,7 @@ def write_held_out_clips(
     """
     folder.mkdir(parents=True)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        parts = {row["item_id"]: Path(scratch) / f"{opaque(key, row['item_id'])}.mp4" for row in items}
+        parts = {row["item_id"]: Path(scratch) / f"{opaque_name(key, row['item_id'])}.mp4" for row in items}
         with ThreadPoolExecutor(cores()) as pool:
             deque(pool.map(partial(_write_own_clip, sources, key, parts), items), maxlen=0)
         size, digests = max(path.stat().st_size for path in parts.values()) + _BOX.size, dict[str, str]()
@@ -57,7 +57,7 @@ def _write_own_clip(
     """Encode an item's frames anew, under noise of at most one level that its key draws."""
     frames, times = decode(sources[item["clip"]])
     rate = round((len(times) - 1) / float(times[-1] - times[0])) if len(times) > 1 else 1
-    rng = np.random.default_rng(int(opaque(key, f"noise of {item['item_id']}"), 16))
+    rng = np.random.default_rng(int(opaque_name(key, f"noise of {item['item_id']}"), 16))
     noise = rng.integers(-1, 2, frames.shape[1:], np.int16)
     encode([*np.clip(frames + noise, 0, 255).astype(np.uint8)], parts[item["item_id"]], rate)
 

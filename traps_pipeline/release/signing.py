@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.release.checksums import SIGNATURE
 
 
 def _library() -> Any:
-    require("sign")
+    require_extra("sign")
     return import_module("model_signing")
 
 

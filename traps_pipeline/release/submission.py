@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.base.archives import BadArchive, reading_archive
-from traps_pipeline.base.archives import pack as pack_archive
+from traps_pipeline.base.archives import zip_bytes as pack_archive
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.terminal import plain
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
 from traps_pipeline.judging.judging_rows import VOTES
@@ -101,7 +101,7 @@ class Submission:
 # --- packing ----------------------------------------------------------------------------------------------------------
 
 
-def pack(workspace: Workspace, target: Path, name: str) -> About:
+def pack_submission(workspace: Workspace, target: Path, name: str) -> About:
     """Write a study's submission, equal bytes for equal studies. Raises TrapsError unless it is judged and scored."""
     begin_publication(workspace.root, "a submission")
     study = workspace.study
@@ -135,7 +135,7 @@ def pack(workspace: Workspace, target: Path, name: str) -> About:
             files={file: hashlib.sha256(data).hexdigest() for file, data in content.items()},
         )
     except ValidationError as error:
-        raise TrapsError(f"--name {name!r:.100}: {explain(error)}; use lower-case letters, digits, - and .") from error
+        raise TrapsError(f"--name {name!r:.100}: {faults_of(error)}; use letters a to z, digits, - and .") from error
     write_bytes(target, pack_archive({ABOUT: description.model_dump_json(indent=1).encode() + b"\n", **content}))
     return description
 
@@ -177,7 +177,7 @@ def read_submission(path: Path) -> Submission:
     try:
         description = About.model_validate_json(content[ABOUT])
     except ValidationError as error:
-        raise TrapsError(f"{path}: {ABOUT}: {explain(error)}; pack it again with `traps publish submit`") from error
+        raise TrapsError(f"{path}: {ABOUT}: {faults_of(error)}; pack it again with `traps publish submit`") from error
     altered_tables = [
         file for file in TABLES if description.files.get(file) != hashlib.sha256(content[file]).hexdigest()
     ]

@@ -10,6 +10,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,14 @@ from traps_pipeline.benchmark.items import commonest_answers, item_hash
 from traps_pipeline.judging.judging_rows import VOTES
 from traps_pipeline.judging.panel import parse_vote, tasks_for, vote_request
 from traps_pipeline.judging.rules import RuleJudge
-from traps_pipeline.judging.verdicts import decide
+from traps_pipeline.judging.verdicts import verdicts_of
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.reading.interpret import degenerate, read_answer
 from traps_pipeline.models.reading.judged_answers import is_correct
 from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.models.registry.judges import RULE, RULES_VERSION, id_of_judges
 from traps_pipeline.models.registry.prompts import prompt_version
-from traps_pipeline.models.request import JUDGED, Outcome, Request
+from traps_pipeline.models.request import JUDGED_OUTCOMES, Outcome, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, dataset_of
 from traps_pipeline.protocol.regimes import REGIMES
@@ -218,11 +219,11 @@ def _wrong_answers(answers: Sequence[Row], items: Mapping[str, Row]) -> Iterator
         if any(row[name] != item[name] for name in _ITEM_COLUMNS):
             yield f"answer of {_row_name(row)}: its pair, side, dataset or version is not its item's"
         text = row["text"] or ""
-        if (row["outcome"] in JUDGED) != bool(text.strip()):
+        if (row["outcome"] in JUDGED_OUTCOMES) != bool(text.strip()):
             yield f"answer of {_row_name(row)}: outcome {row['outcome']!r} does not go with its text"
-        elif row["outcome"] in JUDGED and (reason := degenerate(text)):
+        elif row["outcome"] in JUDGED_OUTCOMES and (reason := degenerate(text)):
             yield f"answer of {_row_name(row)}: {reason}, so it is none"
-        elif row["outcome"] in JUDGED and row["is_json"] != read_answer(row, None, row["regime"]).is_json:
+        elif row["outcome"] in JUDGED_OUTCOMES and row["is_json"] != read_answer(row, None, row["regime"]).is_json:
             yield f"answer of {_row_name(row)}: is_json is {row['is_json']}, which its text is not"
     expected = dict[str, set[str]]()
     for id_, item in items.items():
@@ -252,12 +253,11 @@ def _wrong_votes(
     submission: Submission, votes: Sequence[Row], answers: Sequence[Row], items: Mapping[str, Row]
 ) -> Iterator[str]:
     seats = {seat.id: seat for seat in submission.about.judges}
-    texts = {
-        (row["item_id"], row["model"], row["regime"], row["run"]): row for row in answers if row["outcome"] in JUDGED
-    }
+    key_of = itemgetter("item_id", "model", "regime", "run")
+    texts = {key_of(row): row for row in answers if row["outcome"] in JUDGED_OUTCOMES}
     cast = dict[tuple[Any, ...], set[tuple[str, str]]]()
     for row in votes:
-        key = (row["item_id"], row["model"], row["regime"], row["run"])
+        key = key_of(row)
         answer, item, seat = texts.get(key), items.get(row["item_id"]), seats.get(row["judge"])
         if answer is None or item is None or seat is None or row["task"] not in tasks_for(item["side"]):
             yield f"vote of {row['judge']!r:.60} on {row['task']!r:.40} of {_row_name(row)}: there is nothing to judge"
@@ -344,7 +344,7 @@ def _numbers(verified: Verification, submission: Submission) -> None:
         tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
         items, answers, votes = tables
         columns = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
-        verdicts = decide(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
+        verdicts = verdicts_of(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
             {"panel": panel}
         )
         verified.verdicts, verified.scored = verdicts, score(verdicts)

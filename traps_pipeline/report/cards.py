@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEDIA = {"svg": "image/svg+xml", "webp": "image/webp", "csv": "text/csv", "tex": "application/x-tex"}
-Address = Callable[[SourceItems], str]
+LinkOf = Callable[[SourceItems], str]
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def explorer_address(behind: SourceItems) -> str:
     return f"{EXPLORER}#{answers_view(**vars(behind))}"
 
 
-def table_card(report: TableReport, sources: Sources, address: Address | None = explorer_address) -> Card:
+def table_card(report: TableReport, sources: Sources, address: LinkOf | None = explorer_address) -> Card:
     """Return the card of a study's tables."""
     name = _name(report)
     try:
@@ -120,7 +120,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
     return Card(_name(report), report.title, _fragment("tables", own=[], absent=[], published=tables))
 
 
-def tables_html(tables: Sequence[PrintedTable], title: str, address: Address | None) -> list[Mapping[str, object]]:
+def tables_html(tables: Sequence[PrintedTable], title: str, address: LinkOf | None) -> list[Mapping[str, object]]:
     """Return each table's title (empty if the card's), fragment and downloads by name."""
     return [
         {

@@ -19,11 +19,11 @@ from traps_pipeline.report.tables.table_columns import (
     EPOCH,
     MISSING,
     MODEL,
-    OTHER_FIGURES,
+    OTHER_METRICS,
     PECS,
     REGIME,
     RUNS,
-    SHARES,
+    SHARE_COLUMNS,
     N,
     cell_trace,
     interval,
@@ -39,7 +39,7 @@ from traps_pipeline.report.terms import (
     MISSING_MARK,
     OVERRULED_ABOVE,
     OVERRULED_MARK,
-    TITLES,
+    TITLE_OF,
     TWO_WAY_MEANINGS,
 )
 from traps_pipeline.report.writing import NONE, Column, PrintedTable, SourceItems, fraction, table_markdown, table_text
@@ -132,7 +132,7 @@ def _rows_by_panel(board: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 
 def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool, suffix: str) -> list[PrintedTable]:
     datasets = set(board["dataset"])
-    ranked_dataset = next((name for name in TITLES if name in datasets), "overall")
+    ranked_dataset = next((name for name in TITLE_OF if name in datasets), "overall")
     other_datasets = [name for name in DATASETS if name in datasets and name != ranked_dataset]
     beside = two_way if ranked_dataset == "overall" else None
     other_tables = [
@@ -211,9 +211,9 @@ def _leaderboard(
     board: pd.DataFrame, dataset: str, others: Sequence[str], two_way: pd.DataFrame | None, brief: bool, suffix: str
 ) -> PrintedTable:
     rows = _entries(board, dataset, others)
-    columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARES, *OTHER_FIGURES]
+    columns = [MODEL, REGIME, replace(PECS, bar=True), Column("ci", "95 % CI", "range"), *SHARE_COLUMNS, *OTHER_METRICS]
     for name in others:
-        title = name.replace("_ill_posed", " ill-posed") if brief else TITLES[name]  # a comma would end it in a list
+        title = name.replace("_ill_posed", " ill-posed") if brief else TITLE_OF[name]  # a comma would end it in a list
         columns.append(Column(name, f"PECS {title}", "fraction", mark=f"{name}_mark", group=name == others[0]))
     refusals = list[str]()
     if two_way is not None and len(shown := rows[["model", "regime"]].merge(two_way.loc[two_way["n_scenarios"] > 0])):
@@ -233,7 +233,7 @@ def _leaderboard(
         is_mixed = board["panel"].str.contains("+", regex=False).any()
         notes = ["not ranked: each entry is of several panels" if is_mixed else "ranked by PECS", *notes]
     return PrintedTable(
-        f"leaderboard_{dataset}{suffix}", TITLES[dataset], rows, columns, notes, "this study has no leaderboard yet",
+        f"leaderboard_{dataset}{suffix}", TITLE_OF[dataset], rows, columns, notes, "this study has no leaderboard yet",
         _trace,
         dash="not all four datasets evaluated, or nothing decided" if dataset == "overall" else "nothing decided",
         lead=provenance(board),

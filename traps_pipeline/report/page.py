@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from traps_pipeline.report.cards import Address, Card, tables_html
+from traps_pipeline.report.cards import Card, LinkOf, tables_html
 from traps_pipeline.report.leaderboard_page import leaderboards, legend, provenance
 from traps_pipeline.report.study_findings import StudyFinding
 from traps_pipeline.report.writing import TEMPLATES, environment
@@ -21,7 +21,7 @@ def report_html(
     tables: Sequence[Card] = (),
     *,
     findings: Sequence[StudyFinding] = (),
-    address: Address | None = None,
+    address: LinkOf | None = None,
     explorer: str = "",
     two_way: pd.DataFrame | None = None,
     notes: Sequence[str] = (),

@@ -9,14 +9,14 @@ from typing import Any
 
 import pandas as pd
 
-from traps_pipeline.base.archives import pack
+from traps_pipeline.base.archives import zip_bytes
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.report.cards import (
     EXPLORER,
-    Address,
     Card,
+    LinkOf,
     Sources,
     explorer_address,
     figure_card,
@@ -37,7 +37,7 @@ from traps_pipeline.report.writing import NotRun, environment, figure_files, tab
 from traps_pipeline.storage.workspace import Workspace
 
 PAGE, MARKDOWN, METRICS, INDEX = "report.html", "leaderboard.md", "metrics.jsonl", "index.html"
-PAPER = "paper"  # the chapter of the paper's cards, which use only `assets/published`
+PAPER_CHAPTER = "paper"  # the chapter of the paper's cards, which use only `assets/published`
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Part:
     inputs: Callable[[], Any] | None = None
 
 
-def report_parts(sources: Sources, address: Address | None = explorer_address) -> list[Part]:
+def report_parts(sources: Sources, address: LinkOf | None = explorer_address) -> list[Part]:
     """Return a report's parts in page order; with `address`, numbers are links."""
     # A study with mechanistic analyses leads with the figures that could refute its claims.
     first = INSIDE if sources.workspace.study.mechanism else ()
@@ -89,7 +89,7 @@ def report_parts(sources: Sources, address: Address | None = explorer_address) -
         for report in TABLE_REPORTS
     ]
     paper = [
-        Part(PAPER, f"{kind}-{report.name}", lambda report=report: paper_card(report, sources), ("published",))
+        Part(PAPER_CHAPTER, f"{kind}-{report.name}", lambda report=report: paper_card(report, sources), ("published",))
         for kind, reports in (("figure", FIGURE_REPORTS), ("table", TABLE_REPORTS))
         for report in reports
         if report.published
@@ -108,11 +108,11 @@ def _contents(report: TableReport, study: Results) -> list[Any]:
 
 
 def report_files(
-    study: Results, cards: Sequence[tuple[str, Card]], address: Address | None = explorer_address
+    study: Results, cards: Sequence[tuple[str, Card]], address: LinkOf | None = explorer_address
 ) -> dict[str, bytes]:
     """Return report page and leaderboard (Markdown, JSON lines) by path, from cards."""
     remarks = people_notes(study.human_row, study.panel_errors, study.certified)
-    paper = {card.name: card.html for chapter, card in cards if chapter == PAPER}
+    paper = {card.name: card.html for chapter, card in cards if chapter == PAPER_CHAPTER}
     figures, pictures, tables = (
         [replace(card, paper=paper.get(card.name, "")) for chapter, card in cards if chapter == name]
         for name in ("figures", "pictures", "tables")
@@ -145,7 +145,7 @@ def export(workspace: Workspace, target: Path, say: Callable[[str], None] = lamb
         else:
             write_bytes(target / path, content)
     index = _index(paths).encode()
-    write_bytes(*((target, pack(members | {INDEX: index}, level=6)) if is_zip else (target / INDEX, index)))
+    write_bytes(*((target, zip_bytes(members | {INDEX: index}, level=6)) if is_zip else (target / INDEX, index)))
     return len(paths) + 1
 
 

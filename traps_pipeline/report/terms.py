@@ -4,7 +4,7 @@ from traps_pipeline.protocol.datasets import ARMS, GRADED, TWO_EVENTS, VARIATION
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES
 from traps_pipeline.scoring.score_rows import BROKEN_ABOVE, INCOMPLETE_BELOW
 
-TITLES = {
+TITLE_OF = {
     "overall": "Overall",
     "occlusion": "Occlusion",
     "occlusion_ill_posed": "Occlusion, ill-posed",

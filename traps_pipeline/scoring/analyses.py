@@ -61,12 +61,12 @@ def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
     scope: `category`, `sub_scenario` or `label` (the control's answer in a sub-scenario). Columns as in `study_cells`,
     and `scope`, which names the part.
     """
-    from traps_pipeline.scoring.standings import group_figure
+    from traps_pipeline.scoring.standings import group_metric
 
     parts = metrics["scope"].str.partition(":")
     rows = metrics.assign(scope=parts[2]).loc[parts[0] == scope]
     groups = rows.groupby([*_ENTRY, "scope"], sort=True)
-    cells = group_figure(groups, SHARES)
+    cells = group_metric(groups, SHARES)
     cells["n_pairs"], cells["n_missing"] = groups["n_pairs"].max(), groups["n_missing"].sum()
     cells["n_runs"], cells["epoch"] = groups["run"].nunique(), joined_in_groups(groups, "epoch", joined_epochs)
     return cells.reset_index()

@@ -20,8 +20,8 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts
 
 TAXONOMIES = ("occlusion", "chaotic")
 ENTRY = ["model", "regime", "dataset"]
-RESAMPLED_FIGURES = tuple(METRIC_WORDS)
-INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED_FIGURES for end in ("low", "high")]
+RESAMPLED_METRICS = tuple(METRIC_WORDS)
+INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED_METRICS for end in ("low", "high")]
 RESAMPLES, SEED = 10_000, 20260101
 _GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
 _LEVEL = 0.95
@@ -32,8 +32,8 @@ _IN_MEAN = 0.5**0.5  # of two taxonomies: their errors are independent, so squar
 class ResampledFigures:
     """The mean over runs of every figure, observed and in every resample.
 
-    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED_FIGURES) float64; values:
-    (entries, 2, RESAMPLED_FIGURES, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
+    entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED_METRICS) float64; values:
+    (entries, 2, RESAMPLED_METRICS, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
     for an `overall` entry without a run that has all four datasets.
     """
 
@@ -43,7 +43,7 @@ class ResampledFigures:
 
     def figure(self, name: str) -> np.ndarray:
         """Return the ends of one figure: (entries, 2, resamples)."""
-        return self.values[:, :, RESAMPLED_FIGURES.index(name)]
+        return self.values[:, :, RESAMPLED_METRICS.index(name)]
 
 
 def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledFigures:
@@ -64,16 +64,16 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
     entries, observed = list[tuple[str, str, str]](), list[np.ndarray]()
     n_entries = groups.ngroups * (len(DATASETS) + 1)  # at most
     # float32 takes half the memory, and half the time of quantiles.
-    values = np.empty((n_entries, 2, len(RESAMPLED_FIGURES), resamples), np.float32)
+    values = np.empty((n_entries, 2, len(RESAMPLED_METRICS), resamples), np.float32)
     with threadpool_limits(1):  # threads of products this small wait for each other, which takes as long again
         for key, group in groups:
             model, regime = cast(tuple[str, str], key)
             sums = run_sums(group, resampling, f"{model}|{regime}")
-            for dataset, mean in means_over_runs(sums, figures_of, resamples + 1).items():
+            for dataset, mean in means_over_runs(sums, metrics_of, resamples + 1).items():
                 values[len(entries)] = mean[..., 1:]
                 observed.append(mean[1, :, 0])
                 entries.append((model, regime, dataset))
-    figures = np.array(observed).reshape(len(entries), len(RESAMPLED_FIGURES))
+    figures = np.array(observed).reshape(len(entries), len(RESAMPLED_METRICS))
     return ResampledFigures(entries, figures, values[: len(entries)])
 
 
@@ -81,7 +81,7 @@ def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFram
     """Return 95 % intervals (ENTRY, INTERVAL_COLUMNS) by entry, null where undecided."""
     ends = [
         interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
-        for k, name in enumerate(RESAMPLED_FIGURES)
+        for k, name in enumerate(RESAMPLED_METRICS)
     ]
     table = pd.DataFrame(resampled.entries, columns=pd.Index(ENTRY))
     bounds = np.concatenate(ends, axis=-1) if resampled.entries else np.zeros((0, len(INTERVAL_COLUMNS)))
@@ -225,8 +225,8 @@ def ends_of_shares(counts: pd.DataFrame, resampling: Resampling, named: str) -> 
     return shares_of(with_unseen(np.sum(parts, axis=0), decided, resampling.unseen(named, len(decided))))
 
 
-def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED_FIGURES, resamples).
+def metrics_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
+    """Return scores from sums, (.., 9, resamples) -> (2, .., RESAMPLED_METRICS, resamples).
 
     The sums are those of COUNTS with an unseen scenario. in_mean: as in `shares_of`.
     """
@@ -234,7 +234,7 @@ def figures_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
 
 def figures_of_shares(shares: np.ndarray) -> np.ndarray:
-    """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED_FIGURES, resamples).
+    """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED_METRICS, resamples).
 
     The three are the ends of Acc, FalseAbs and AbsRec.
     """
@@ -275,9 +275,9 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
 def means_over_runs(
     sums: Mapping[tuple[str, int], np.ndarray], figures: Callable[[np.ndarray, bool], np.ndarray], draws: int
 ) -> dict[str, np.ndarray]:
-    """Return dataset or `overall` -> mean over runs (2, RESAMPLED_FIGURES, draws).
+    """Return dataset or `overall` -> mean over runs (2, RESAMPLED_METRICS, draws).
 
-    sums: the `run_sums` of (dataset, run). figures: the function (`figures_of`) that computes figures from them.
+    sums: the `run_sums` of (dataset, run). figures: the function (`metrics_of`) that computes figures from them.
     """
     runs = sorted({run for _, run in sums})
     means = {
@@ -286,7 +286,7 @@ def means_over_runs(
         if any((dataset, run) in sums for run in runs)
     }
     complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
-    undefined = np.full((2, len(RESAMPLED_FIGURES), draws), np.nan)
+    undefined = np.full((2, len(RESAMPLED_METRICS), draws), np.nan)
     return {**means, "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else undefined}
 
 

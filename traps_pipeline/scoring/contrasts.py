@@ -19,7 +19,7 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.scoring.bootstrap import (
     ENTRY,
-    RESAMPLED_FIGURES,
+    RESAMPLED_METRICS,
     RESAMPLES,
     ResampledFigures,
     difference,
@@ -32,7 +32,7 @@ from traps_pipeline.scoring.metrics import CELL, cell_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS, REGIME_TESTS
 from traps_pipeline.scoring.standings import means_over_runs, standings
 
-CONTRASTED_FIGURES = ("pecs", "j")
+CONTRASTED_METRICS = ("pecs", "j")
 SEPARABLE_BELOW = 0.05
 VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # columns that `version_contrasts` has for each side
 _FAMILY = ["kind", "dataset", "figure", "_regime"]
@@ -60,10 +60,10 @@ def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.D
             "refused": refusal_reason,
         }
         row |= dict(zip(_SIDES, (*left, *right), strict=True))
-        rows += [{**row, "figure": figure} for figure in CONTRASTED_FIGURES]
+        rows += [{**row, "figure": figure} for figure in CONTRASTED_METRICS]
     places = {entry: row for row, entry in enumerate(resampled.entries)}
-    means = means_over_runs(metrics).loc[:, [*CONTRASTED_FIGURES]].to_dict("index")
-    for figure in CONTRASTED_FIGURES:
+    means = means_over_runs(metrics).loc[:, [*CONTRASTED_METRICS]].to_dict("index")
+    for figure in CONTRASTED_METRICS:
         compared_rows = [row for row in rows if row["figure"] == figure and row["refused"] is None]
         for first in range(0, len(compared_rows), _AT_ONCE):
             part = compared_rows[first : first + _AT_ONCE]
@@ -102,7 +102,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     rows = []
     for entry, entry_columns in board.to_dict("index").items():
         refusal_reason = refusal(items_of[0][entry], items_of[1][entry])
-        for figure in CONTRASTED_FIGURES:
+        for figure in CONTRASTED_METRICS:
             values = {
                 f"{name}_{side}": entry_columns[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")
             }
@@ -114,7 +114,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
             }
             row["n_scenarios"] = sizes[entry]
             if refusal_reason is None:
-                ends = [side_figures[entry][None, :, RESAMPLED_FIGURES.index(figure)] for side_figures in draws[::-1]]
+                ends = [side_figures[entry][None, :, RESAMPLED_METRICS.index(figure)] for side_figures in draws[::-1]]
                 row |= _differences(figure, ends, [[row["now"]], [row["then"]]], [sizes[entry]])[0]
             rows.append(row | {"refused": refusal_reason})
     columns = [
@@ -151,7 +151,7 @@ def _standings(verdicts: pd.DataFrame) -> pd.DataFrame:
     """Return `leaderboard.standings` of verdicts, indexed by ENTRY."""
     cells = [cell_metrics(part, {}) for _, part in verdicts.groupby("dataset")]
     board = standings(pd.concat(cells, ignore_index=True)).set_index(ENTRY)
-    return board.loc[:, ["n_pairs", *CONTRASTED_FIGURES, *VERSION_SIDES]]
+    return board.loc[:, ["n_pairs", *CONTRASTED_METRICS, *VERSION_SIDES]]
 
 
 def regime_tests(verdicts: pd.DataFrame) -> pd.DataFrame:

@@ -14,14 +14,14 @@ import pandas as pd
 
 from traps_pipeline.protocol.datasets import datasets_of_category
 from traps_pipeline.scoring.bootstrap import (
-    RESAMPLED_FIGURES,
+    RESAMPLED_METRICS,
     RESAMPLES,
     SEED,
     Resampling,
     difference,
     draw_scenarios,
-    figures_of,
     limits_of,
+    metrics_of,
     run_sums,
     shares_of,
     with_interval,
@@ -191,7 +191,7 @@ def _row(
         **dict.fromkeys(_ends("change")),
     }
     for name in SHARES:
-        row |= with_interval(name, figures[:, RESAMPLED_FIGURES.index(name)], limits_of(name))
+        row |= with_interval(name, figures[:, RESAMPLED_METRICS.index(name)], limits_of(name))
     row["value"] = _compared_figure(hypothesis, figures)[1, 0]
     if dose is hypothesis.doses[0] or reference.empty:
         return row
@@ -212,7 +212,7 @@ def _row(
 
 
 def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
-    """Return ends of RESAMPLED_FIGURES and of abstentions, (2, RESAMPLED_FIGURES + 1, draws).
+    """Return ends of RESAMPLED_METRICS and of abstentions, (2, RESAMPLED_METRICS + 1, draws).
 
     They are computed over all items of a run, then averaged over runs.
     """
@@ -221,12 +221,12 @@ def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndar
     for sums_of_run in sums.values():
         rows = dict(zip(_SUMS, sums_of_run, strict=True))
         abstention_sums = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", "_unseen")]
-        run_figures.append(np.concatenate([figures_of(sums_of_run), shares_of(np.stack(abstention_sums))], axis=1))
+        run_figures.append(np.concatenate([metrics_of(sums_of_run), shares_of(np.stack(abstention_sums))], axis=1))
     return np.mean(run_figures, axis=0)
 
 
 def _compared_figure(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
-    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED_FIGURES.index("j")]
+    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED_METRICS.index("j")]
 
 
 def _ends(name: str) -> list[str]:

@@ -28,7 +28,7 @@ PARTS = ("regret_label", "regret_rash", "regret_shy")
 _ANSWER = ["item_id", "model", "regime", "run"]
 _MEANS = ("top", *PARTS, "abstains_right", "abstains_wrong", "stated", "brier_ideal", "brier_even")
 _MEANS += ("points_ideal", "points_best", "points_prior")
-_FIGURES = ["answers", "wrong", *WITH_INTERVAL, *_MEANS]
+_METRICS = ["answers", "wrong", *WITH_INTERVAL, *_MEANS]
 _ROUNDING = 1e-9
 
 
@@ -121,7 +121,7 @@ def graded(
         rows.append({**verdict, "taxonomy": "chaotic", "top": max(item.posterior.values()), **figures})
     if not rows:
         return pd.DataFrame(columns=pd.Index(GRADED_CUTS.names))
-    items = pd.DataFrame(rows).reindex(columns=[*verdicts.columns, "taxonomy", *_FIGURES])
+    items = pd.DataFrame(rows).reindex(columns=[*verdicts.columns, "taxonomy", *_METRICS])
     resampling, table = draw_scenarios(items, resamples, seed), []
     starts = np.searchsorted(SCOPES, items["top"] + _ROUNDING, side="right") - 1
     for (model, regime), group in cast(Any, items.groupby(["model", "regime"], sort=True)):
@@ -224,7 +224,7 @@ def _commonest(posterior: Mapping[str, float]) -> str:
 def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, Any]:
     """Return scores of a model's and regime's items, each scenario counting once."""
     with_decision = items.loc[items["points"].notna()]
-    scenario_means = with_decision.groupby("scenario_id")[_FIGURES].mean()
+    scenario_means = with_decision.groupby("scenario_id")[_METRICS].mean()
     row: dict[str, Any] = {
         "n_runs": with_decision["run"].nunique(),
         "n_items": len(scenario_means),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.protocol.metric_words import COUNT_WORDS, METRIC_WORDS
 from traps_pipeline.scoring.score_rows import METRICS
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CELL = ["dataset", "model", "regime", "run"]
-CELL_FIGURES = [*METRIC_WORDS, "naive"]
+CELL_METRICS = [*METRIC_WORDS, "naive"]
 BOUNDS = ["pecs_low", "pecs_high"]
 # The outcomes in each count of items. An item is answered if its answer is judged, even if the judges are undecided.
-OUTCOMES = {"n_answered": JUDGED} | {c.name: c.outcomes for c in COUNT_WORDS.values() if c.outcomes}
+OUTCOMES = {"n_answered": JUDGED_OUTCOMES} | {c.name: c.outcomes for c in COUNT_WORDS.values() if c.outcomes}
 COUNT_COLUMNS = [*OUTCOMES, "n_not_json"]
 REJECTION_COLUMNS = [count.name for count in COUNT_WORDS.values() if count.is_of_decisions]
 # For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
@@ -138,7 +138,7 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
 
 
 def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return CELL_FIGURES of every cell, (cells,) each."""
+    """Return CELL_METRICS of every cell, (cells,) each."""
     acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
     figures = {name: metric.formula(acc, false_abs, abs_rec) for name, metric in METRIC_WORDS.items()}
     return figures | {"naive": acc * abs_rec}

@@ -16,7 +16,7 @@ from statistics import NormalDist
 import numpy as np
 
 from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
-from traps_pipeline.scoring.bootstrap import RESAMPLED_FIGURES, TAXONOMIES, figures_of, interval, limits_of
+from traps_pipeline.scoring.bootstrap import RESAMPLED_METRICS, TAXONOMIES, interval, limits_of, metrics_of
 from traps_pipeline.scoring.contrasts import SEPARABLE_BELOW, least_p
 from traps_pipeline.scoring.metrics import pecs_of
 
@@ -124,5 +124,5 @@ def _pecs(answers: np.ndarray, unseen: np.ndarray, in_mean: bool) -> np.ndarray:
     sums = np.stack([part for n_yes in yes for part in (n_yes, all_pairs)], axis=1)
     unseen_draws = np.broadcast_to(unseen, (len(answers), *unseen.shape))
     return np.moveaxis(
-        figures_of(np.concatenate([sums, unseen_draws], axis=1), in_mean)[:, :, RESAMPLED_FIGURES.index("pecs")], 0, 1
+        metrics_of(np.concatenate([sums, unseen_draws], axis=1), in_mean)[:, :, RESAMPLED_METRICS.index("pecs")], 0, 1
     )

@@ -14,7 +14,7 @@ from traps_pipeline.scoring.bootstrap import ENTRY, limits_of
 from traps_pipeline.scoring.metrics import (
     BOUNDS,
     CELL,
-    CELL_FIGURES,
+    CELL_METRICS,
     COUNT_COLUMNS,
     REJECTION_COLUMNS,
     joined_epochs,
@@ -45,8 +45,8 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     without a text count in no figure; if there are too many of them, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
-    means = group_figure(groups, [*CELL_FIGURES, "pecs_by_family", *BOUNDS])
-    deviations = group_figure(groups, CELL_FIGURES, np.std)
+    means = group_metric(groups, [*CELL_METRICS, "pecs_by_family", *BOUNDS])
+    deviations = group_metric(groups, CELL_METRICS, np.std)
     sums = cast(pd.DataFrame, groups[_SUMMED].sum())
     sums[REJECTION_COLUMNS] = groups[REJECTION_COLUMNS].sum(min_count=1)
     board = means.join([deviations.add_suffix("_std"), sums])
@@ -63,8 +63,8 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return CELL_FIGURES by ENTRY from METRICS rows, as on the leaderboard."""
-    return group_figure(_runs(metrics).groupby(ENTRY, sort=True), CELL_FIGURES)
+    """Return CELL_METRICS by ENTRY from METRICS rows, as on the leaderboard."""
+    return group_metric(_runs(metrics).groupby(ENTRY, sort=True), CELL_METRICS)
 
 
 def _runs(metrics: pd.DataFrame) -> pd.DataFrame:
@@ -80,7 +80,7 @@ def _family_pecs(metrics: pd.DataFrame) -> pd.DataFrame:
     The paper calls a family a sub-scenario.
     """
     families = metrics.loc[metrics["scope"].str.startswith("sub_scenario:")].groupby(CELL)
-    shares = group_figure(families, ["acc", "abs_rec", "false_abs"])
+    shares = group_metric(families, ["acc", "abs_rec", "false_abs"])
     pecs = pecs_of(shares["acc"].to_numpy(float), (shares["abs_rec"] - shares["false_abs"]).to_numpy(float))
     return shares.assign(pecs_by_family=pecs)[["pecs_by_family"]].reset_index()
 
@@ -91,7 +91,7 @@ def _overall_runs(cells: pd.DataFrame) -> pd.DataFrame:
     complete_runs = cells.loc[groups["dataset"].transform("nunique") == len(DATASETS)].groupby(_RUN, sort=True)
     counts = cast(pd.DataFrame, complete_runs[["n_pairs", *_SUMMED]].sum())
     counts[REJECTION_COLUMNS] = complete_runs[REJECTION_COLUMNS].sum(min_count=1)
-    overall = group_figure(complete_runs, [*CELL_FIGURES, "pecs_by_family", *BOUNDS]).join(counts)
+    overall = group_metric(complete_runs, [*CELL_METRICS, "pecs_by_family", *BOUNDS]).join(counts)
     overall["epoch"] = joined_in_groups(complete_runs, "epoch", joined_epochs)
     overall["panel"] = joined_in_groups(complete_runs, "panel", joined_epochs)
     overall["benchmark_version"] = joined_in_groups(complete_runs, "benchmark_version", joined_versions)
@@ -104,7 +104,7 @@ def _spread_flags(wrong: pd.Series) -> pd.Series:
     return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
 
-def group_figure(groups: Any, columns: Sequence[str], figure: Callable[..., np.ndarray] = np.mean) -> pd.DataFrame:
+def group_metric(groups: Any, columns: Sequence[str], figure: Callable[..., np.ndarray] = np.mean) -> pd.DataFrame:
     """Return a figure of each group's values in some columns, indexed by group.
 
     It is null if any value is null, so that no mean silently uses fewer values. Groups of one size are one array.

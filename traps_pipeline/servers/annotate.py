@@ -17,14 +17,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.webguard import TOKEN_OWNER
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.people.judge_validation import sheet_rows
 from traps_pipeline.people.label_units import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
 from traps_pipeline.people.labels import LABELS
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.servers.labelstore import LabelStore, NotWaiting
-from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page, script, study_file
+from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page_html, script, study_file
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -133,7 +133,7 @@ class Annotation:
         try:
             label = LABELS[task].model_validate(sent.label)
         except ValidationError as error:
-            raise Refused(explain(error)) from error
+            raise Refused(faults_of(error)) from error
         try:
             self.store.record(who, task, unit, label.model_dump())
         except NotWaiting as error:
@@ -177,7 +177,7 @@ class Annotation:
 
     def start_page(self, who: str) -> str:
         """Return the page with a person's choice of tasks."""
-        return page("annotate_start.html.j2", who=who, tasks=self._tasks(who))
+        return page_html("annotate_start.html.j2", who=who, tasks=self._tasks(who))
 
     def unit_page(self, who: str, task: TaskName) -> str:
         """Return the page of the next unit, or one that says why there is none now."""
@@ -186,8 +186,8 @@ class Annotation:
         page_values = {"who": who, "tasks": self._tasks(who), "task": task, "title": TITLES[task], "done": finished}
         if unit is None:
             hours = annotation_protocol().sitting_hours
-            return page("annotate_done.html.j2", **page_values, total=total, hours=f"{hours:g}")
-        return page("annotate.html.j2", **page_values, total=total, shown=self.shown(who, task, unit))
+            return page_html("annotate_done.html.j2", **page_values, total=total, hours=f"{hours:g}")
+        return page_html("annotate.html.j2", **page_values, total=total, shown=self.shown(who, task, unit))
 
     def _tasks(self, who: str) -> dict[TaskName, tuple[str, int, int]]:
         """Return title, labelled and total units of each task."""

@@ -15,9 +15,9 @@ from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Resp
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.yamlfile import explain
+from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
-from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decide, decisions_on, is_reviewed, undo
+from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decisions_on, is_reviewed, save_decision, undo_decision
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
@@ -25,7 +25,7 @@ from traps_pipeline.report.explorer.scenario_words import answer_of_control, cer
 from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect
 from traps_pipeline.servers.duplicates import Comparison
 from traps_pipeline.servers.queue import MEANINGS, QUEUES, QueueName, flags, queue
-from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page, script, study_file
+from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page_html, script, study_file
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
@@ -133,7 +133,7 @@ class Review:
             new = {"scenario_id": self._free_id(spec["family"]), "family": spec["family"], "params": params}
             correction, decision_count = correction.model_copy(update=new), 0
         try:
-            decide(correction, decision_count)
+            save_decision(correction, decision_count)
         except DecidedMeanwhile as error:
             raise Conflict(str(error)) from error
 
@@ -146,7 +146,7 @@ class Review:
         """Take back the last decision. Raises NotFound, Refused and Conflict."""
         self.spec(sent.scenario_id)
         try:
-            undo(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
+            undo_decision(sent.scenario_id, sent.seen, who=self.who, why=sent.why)
         except DecidedMeanwhile as error:
             raise Conflict(str(error)) from error
 
@@ -165,7 +165,7 @@ class Review:
         try:
             return Correction.model_validate({**fields, "who": self.who, "when": date.today()})
         except ValidationError as error:
-            raise Refused(f"{scenario_id}: {explain(error)}") from error
+            raise Refused(f"{scenario_id}: {faults_of(error)}") from error
 
     def summary(self) -> CorrectionEffect:
         """Return the effect of the decisions that the study's tables do not contain yet."""
@@ -209,7 +209,7 @@ class Review:
                 "twin": f"Twin, {void} void: {json.loads(spec['twin'])['ground_truth']}",
             },
         }
-        return page(
+        return page_html(
             "review.html.j2",
             shown=fields,
             queue=name,
@@ -229,7 +229,7 @@ class Review:
 
     def done_page(self, name: QueueName) -> str:
         """Return a queue's last page: the decisions' effect, and the next commands."""
-        return page(
+        return page_html(
             "review_done.html.j2",
             effect=self.summary(),
             queue=name,

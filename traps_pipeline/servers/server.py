@@ -55,7 +55,7 @@ def new_app() -> FastAPI:
     return app
 
 
-def page(template: str, **values: Any) -> str:
+def page_html(template: str, **values: Any) -> str:
     """Return a page with the explorer's look and a policy of its own content only."""
     style = (SHARED / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from traps_pipeline.base.archives import BadArchive, pack, unpack
+from traps_pipeline.base.archives import BadArchive, unzip_bytes, zip_bytes
 from traps_pipeline.base.bounded_cache import BoundedCache
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
@@ -102,7 +102,7 @@ class Frames:
 class Media:
     """A clip as it is sent.
 
-    path: the mp4, or the zip of JPEGs; None for profile frames, which `sample` returns. sha256: digest of the sent
+    path: the mp4, or the zip of JPEGs; None for profile frames, which `pick_frames` returns. sha256: digest of the sent
     content (the mp4; the JPEGs one after another; pixels and times), wherever the clip lies. times_s: seconds into the
     clip. fps: playing speed of a video; None for other profiles. size_bytes: size of the file, or of the pixels.
     """
@@ -124,7 +124,7 @@ def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later).pick(times)
 
 
-def sample(clip: Path, spec: MediaSpec) -> Frames:
+def pick_frames(clip: Path, spec: MediaSpec) -> Frames:
     """Return a clip's frames as a model sees them; may raise DamagedClip.
 
     Those of profile frames are cached until the file changes, and shared by callers, who must not change them; the
@@ -244,7 +244,7 @@ def payload(media: Media) -> list[bytes]:
         raise TrapsError("media.profile frames is not sent as bytes; use video or images for a model behind an API")
     try:
         data = media.path.read_bytes()
-        parts = [*unpack(data).values()] if media.profile == "images" else [data]
+        parts = [*unzip_bytes(data).values()] if media.profile == "images" else [data]
     except OSError as error:
         raise _damaged_clip(media.path, error.strerror or str(error)) from error
     except BadArchive as error:
@@ -272,7 +272,7 @@ def _file(note: Path, profile: Profile) -> Path | None:
 def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
     """Pick and encode frames, write the file, and last the note with its digest."""
     _require(clip, clip_digest)
-    frames = sample(clip, spec)
+    frames = pick_frames(clip, spec)
     path, rate = _file(note, spec.profile), None
     if path is None:
         header = str((frames.frames.shape, frames.times_s.tolist())).encode()
@@ -283,7 +283,7 @@ def _make(clip: Path, clip_digest: str, spec: MediaSpec, note: Path) -> Media:
         sha256, size = file_digest(path), path.stat().st_size
     else:
         jpegs = [_jpeg(frame) for frame in frames.frames]
-        data = pack({f"{i:02d}.jpg": jpeg for i, jpeg in enumerate(jpegs)})
+        data = zip_bytes({f"{i:02d}.jpg": jpeg for i, jpeg in enumerate(jpegs)})
         write_bytes(path, data)
         sha256, size = _sha256(jpegs), len(data)
     times = tuple(frames.times_s.tolist())

@@ -16,7 +16,7 @@ SCHEMES = ("s3", "gs", "az")
 Place = Path | str  # a folder, or an address s3://bucket/study
 
 
-def place_of(text: str) -> Place:
+def parse_place(text: str) -> Place:
     """Parse an object store's address or a folder. Raises TrapsError."""
     if "://" not in text:
         folder = Path(text).absolute()

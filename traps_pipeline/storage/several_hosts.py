@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 
 if TYPE_CHECKING:
     import dagster as dg
@@ -57,5 +57,5 @@ class SeveralHosts(Protocol):
 
 def several_hosts() -> SeveralHosts:
     """Return the module for several hosts. Raises TrapsError if its package is not installed."""
-    require("cluster", "traps_cluster")
+    require_extra("cluster", "traps_cluster")
     return cast(SeveralHosts, import_module(_PACKAGE))

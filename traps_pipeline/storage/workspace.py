@@ -19,7 +19,7 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import ASSETS, WORKSPACES, require_history_path, require_root
 from traps_pipeline.base.yamlfile import parse_yaml_model, read_yaml
 from traps_pipeline.storage.parquet import TableStore
-from traps_pipeline.storage.place import STUDY, Place, name_of, place_of, scratch_of
+from traps_pipeline.storage.place import STUDY, Place, name_of, parse_place, scratch_of
 from traps_pipeline.storage.several_hosts import several_hosts
 from traps_pipeline.storage.store import FolderStore, Store
 from traps_pipeline.storage.study import FORMAT, MechanismSettings, Study
@@ -54,7 +54,7 @@ class Workspace:
     @staticmethod
     def default_place() -> Place:
         """Return `$TRAPS_WORKSPACE`, else `.workspaces/default` of the checkout or cwd."""
-        return place_of(os.environ.get(VARIABLE) or str(WORKSPACES / "default"))
+        return parse_place(os.environ.get(VARIABLE) or str(WORKSPACES / "default"))
 
     @staticmethod
     def is_there(place: Place) -> bool:

@@ -38,7 +38,7 @@ from traps_pipeline.models.local import adapter
 from traps_pipeline.models.local.adapter import Sampling, load_local_model
 from traps_pipeline.models.local.decoding import decode
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompt_batches import batches
+from traps_pipeline.models.local.prompt_batches import prompt_batches
 from traps_pipeline.models.local.sampling import SeededNucleus
 from traps_pipeline.models.registry.checkpoint import weight_bytes
 from traps_pipeline.models.registry.entries import ModelEntry
@@ -138,9 +138,9 @@ def test_prompts_with_other_numbers_of_frames_are_answered_in_order_all_the_same
 
 def test_batches_hold_what_fits_and_at_least_one() -> None:
     prompts = three_prompts("qwen3-vl")  # the longest is the second
-    assert list(batches(prompts, [10.0, 10.0, 10.0], 20.0)) == [[2, 0], [1]]
-    assert list(batches(prompts, [10.0, 10.0, 10.0], 5.0)) == [[2], [0], [1]]
-    assert list(batches(prompts, [10.0, 10.0, 10.0], 1e9)) == [[2, 0, 1]]
+    assert list(prompt_batches(prompts, [10.0, 10.0, 10.0], 20.0)) == [[2, 0], [1]]
+    assert list(prompt_batches(prompts, [10.0, 10.0, 10.0], 5.0)) == [[2], [0], [1]]
+    assert list(prompt_batches(prompts, [10.0, 10.0, 10.0], 1e9)) == [[2, 0, 1]]
 
 
 def test_a_batch_that_does_not_fit_is_halved_and_answers_stay_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

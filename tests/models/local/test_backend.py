@@ -28,12 +28,12 @@ from traps_pipeline.mechanism.adapter_checks import CHECKS
 from traps_pipeline.mechanism.probing_versions import loaded_params
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.local.adapter import LocalModel, load_local_model
-from traps_pipeline.models.local.backend import LocalBackend, outcome, seeds, worker
+from traps_pipeline.models.local.backend import LocalBackend, local_outcome, seeds, worker
 from traps_pipeline.models.registry import entries as registry
 from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.registry.entries import ModelEntry, effective_params, load_models
 from traps_pipeline.models.request import Outcome, Request
-from traps_pipeline.storage.media import MediaStore, sample
+from traps_pipeline.storage.media import MediaStore, pick_frames
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +101,7 @@ def test_the_probabilities_of_the_first_token_are_those_of_its_logits_whatever_i
         (kept, other), loaded = answers(of, asked), load_local_model(of)
         assert other.first_token is None
         given[name] = json.loads(str(kept.first_token))
-    seen = sample(clip(), SIX_FRAMES)
+    seen = pick_frames(clip(), SIX_FRAMES)
     prompt = loaded.prompt(SYSTEM, QUESTIONS[0], seen.frames, seen.times_s)
     with torch.inference_mode():
         values, tokens = loaded.network(**loaded.placed(prompt.inputs)).logits[0, -1].softmax(-1).topk(20)
@@ -117,7 +117,7 @@ def test_the_probabilities_of_the_first_token_are_those_of_its_logits_whatever_i
 
 def test_an_answer_cut_off_is_truncated_and_nothing_is_empty() -> None:
     def kind(text: str, finish: str) -> tuple[str, str | None]:
-        made = outcome(text, finish, 10, 3, "m")
+        made = local_outcome(text, finish, 10, 3, "m")
         return made.kind, made.text
 
     assert kind(" left ", "stop") == ("answer", "left")

@@ -11,7 +11,7 @@ from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family, ask, model
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hidden_states import Item, item_states
 from traps_pipeline.models.local.adapter import LocalModel, Prompt
-from traps_pipeline.models.local.spans import changed_tokens, spans
+from traps_pipeline.models.local.spans import changed_tokens, token_spans
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +53,7 @@ def test_visual_tokens_are_those_of_the_processors_placeholders_and_no_others(fa
     ids = prompt.inputs["input_ids"][0]
     places = {kind: ids == getattr(of.processor, f"{kind}_token_id") for kind in ("image", "video")}
     assert {kind for kind, found in places.items() if found.any()} == {kind for kind in places if kind in shown}
-    found = spans(of, prompt, SYSTEM, QUESTIONS[1])
+    found = token_spans(of, prompt, SYSTEM, QUESTIONS[1])
     assert np.array_equal(found["visual"], (places["image"] | places["video"]).numpy())
     assert np.stack([*found.values()]).sum(axis=0).max() == 1
     text = "".join(of.processor.tokenizer.decode(ids[torch.from_numpy(found["question"])]).split())
@@ -72,7 +72,7 @@ def item(prompt: Prompt) -> Item:
 def test_states_are_means_over_the_part_that_the_pooling_names(family: Family) -> None:
     of = model(family)
     prompt = ask(of, QUESTIONS[1])
-    parts, own = spans(of, prompt, SYSTEM, QUESTIONS[1]), library(of, prompt)
+    parts, own = token_spans(of, prompt, SYSTEM, QUESTIONS[1]), library(of, prompt)
     for part in ("visual", "question"):
         found = item_states(of, item(prompt), prompt, part).raw[2]  # pyright: ignore[reportArgumentType]
         assert found == pytest.approx(own[torch.from_numpy(parts[part])].mean(dim=0).numpy(), abs=1e-5)
@@ -115,7 +115,7 @@ def test_states_at_occluder_tokens_are_means_over_the_visual_tokens_that_the_occ
     """A token is 32 x 32 pixels of two frames, hence four: left and right, early and late. The occluder is one."""
     of = model("qwen3-vl")
     one, other = with_occluder(of)
-    mask = spans(of, one, SYSTEM, QUESTIONS[1])["visual"]
+    mask = token_spans(of, one, SYSTEM, QUESTIONS[1])["visual"]
     visual, differs = np.flatnonzero(mask), changed_tokens(one, other, mask)
     assert one.inputs["video_grid_thw"].tolist() == [[2, 2, 4]] and len(visual) == 4
     assert differs is not None and np.flatnonzero(differs).tolist() == [visual[3]]

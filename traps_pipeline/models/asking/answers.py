@@ -11,7 +11,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.cores import cores
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.asking.answer_rows import ResponseRow
-from traps_pipeline.models.asking.ask import Call, SettledCell, collect
+from traps_pipeline.models.asking.ask import Call, SettledCell, collect_outcomes
 from traps_pipeline.models.asking.participants import Row, call_time_columns
 from traps_pipeline.models.framing import media_for_dataset
 from traps_pipeline.models.reading.interpret import read_answer
@@ -162,4 +162,4 @@ def collect_answers(workspace: Workspace, cells: Sequence[Cell]) -> Iterator[tup
         )
 
     entries, calls = [get_model(cell.evaluation.model) for cell in cells], partial(wanted_questions, workspace)
-    yield from collect(workspace, "responses", workspace.answers, entries, cells, calls, finish)
+    yield from collect_outcomes(workspace, "responses", workspace.answers, entries, cells, calls, finish)

@@ -16,10 +16,10 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
 from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
-from traps_pipeline.ledger.rows import settles
+from traps_pipeline.ledger.rows import is_settled
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.asking.draining import drain_on_interrupt
-from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, attempt, ledger_row
+from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, ask_once, ledger_row
 from traps_pipeline.models.asking.refusals import CONTROL, RefusedCalls, control_outcome, refusal, refused_calls
 from traps_pipeline.models.money.budget import Budget, BudgetReached
 from traps_pipeline.models.money.spending import open_budget, share_accounts
@@ -76,7 +76,7 @@ class Work(Generic[AnyCell, AnyCall, Finished]):
     is_counted: bool = False  # the progress was told of all calls before the first
 
 
-def collect(
+def collect_outcomes(
     workspace: Workspace,
     stage: str,
     ledger: Ledger,
@@ -156,12 +156,12 @@ class _Asking:
             return False
         request, name = queue.popleft(), participant.entry.id
         context = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
-        attempt_result = await attempt(participant, request, context)
+        attempt_result = await ask_once(participant, request, context)
         if attempt_result is None:
             return False
         outcome = attempt_result[0] if self.again is None else self.again(attempt_result[0])
         row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
-        progress.current().called(name, not settles(row), row["latency_s"], row["cost_usd"] or 0.0)
+        progress.current().called(name, not is_settled(row), row["latency_s"], row["cost_usd"] or 0.0)
         if self.again is None:
             participant.breaker.watch(outcome)
         return True
@@ -276,7 +276,7 @@ async def _settle_cell(
     if stop.is_set():
         return None
     await its.writer.sync()
-    errors = sum(not settles(row) for row in rows.values())
+    errors = sum(not is_settled(row) for row in rows.values())
     tally = Tally(asked=len(missing), cached=len(requests) - len(missing), errors=errors)
     return SettledCell(cell, calls, {key: rows[key] for key in requests}, tally)
 

@@ -4,7 +4,7 @@ import inspect
 from dataclasses import dataclass, replace
 from typing import get_args
 
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.plugins import Plugin, plugins
 from traps_pipeline.ledger.rows import replace_impossible
 from traps_pipeline.models.registry.entries import LOCAL, NETWORK, Entry, ModelEntry
@@ -14,11 +14,11 @@ from traps_pipeline.models.request import Backend, Outcome, OutcomeKind, Request
 def require_libraries(entry: Entry) -> None:
     """Raise TrapsError, with the command, unless an entry's libraries are installed."""
     if entry.backend == NETWORK:
-        require("api")
+        require_extra("api")
     if entry.backend == LOCAL:
-        require("local")
+        require_extra("local")
         if isinstance(entry, ModelEntry) and entry.local_params().quantisation == "nf4":
-            require("nf4")
+            require_extra("nf4")
 
 
 def make_backend(entry: Entry) -> Backend:

@@ -132,7 +132,7 @@ class CallContext:
     paid_by: list[Reservation] = field(default_factory=list)
 
 
-async def attempt(
+async def ask_once(
     participant: Participant, request: Request, allowed: CallContext
 ) -> tuple[Outcome, int, float] | None:
     """Return an outcome, the number of attempts, and the last one's seconds.

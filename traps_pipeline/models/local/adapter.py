@@ -18,7 +18,7 @@ from typing import Any
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.models.local.library import load_transformers
 from traps_pipeline.models.local.model import GeneratedAnswer, LocalModel, States
@@ -188,7 +188,7 @@ def _precision(params: LocalParams, device: str) -> dict[str, Any]:
 
     options: dict[str, Any] = {"dtype": getattr(torch, params.dtype)}
     if params.quantisation == "nf4":
-        require("nf4")
+        require_extra("nf4")
         options["quantization_config"] = load_transformers().BitsAndBytesConfig(
             load_in_4bit=True,
             bnb_4bit_quant_type="nf4",
@@ -197,6 +197,6 @@ def _precision(params: LocalParams, device: str) -> dict[str, Any]:
         )
         options["device_map"] = {"": device}
     if device == SPREAD:
-        require("nf4", "accelerate")
+        require_extra("nf4", "accelerate")
         options["device_map"] = "auto"
     return options

@@ -18,7 +18,7 @@ from traps_pipeline.models.registry.checkpoint import find_checkpoint
 from traps_pipeline.models.registry.entries import Entry, ModelEntry
 from traps_pipeline.models.request import Outcome, Request
 from traps_pipeline.protocol.datasets import dataset_of
-from traps_pipeline.storage.media import Frames, MediaSpec, sample
+from traps_pipeline.storage.media import Frames, MediaSpec, pick_frames
 from traps_pipeline.video.encode import DamagedClip
 
 GATHER_S = 0.01  # wait after the first request for others that become free together
@@ -101,7 +101,7 @@ class LocalBackend:
         answers = model.generate(prompts, self._params.max_new_tokens, sampling, stopped=batch.abandoned.is_set)
         return [
             replace(
-                outcome(
+                local_outcome(
                     answer.text,
                     answer.finish_reason,
                     answer.prompt_tokens,
@@ -117,7 +117,7 @@ class LocalBackend:
 def _frames(request: Request, spec: MediaSpec) -> Frames:
     assert request.media is not None, "local models are asked about clips"
     try:
-        return sample(request.media, media_for_dataset(spec, dataset_of(str(request.about.get("item_id", "")))))
+        return pick_frames(request.media, media_for_dataset(spec, dataset_of(str(request.about.get("item_id", "")))))
     except DamagedClip as error:
         raise TrapsError(str(error)) from error
 
@@ -127,7 +127,7 @@ def seeds(requests: Sequence[Request]) -> list[int]:
     return [int(request.key[:16], 16) for request in requests]
 
 
-def outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
+def local_outcome(text: str, finish: str, prompt_tokens: int, completion_tokens: int, served_model: str) -> Outcome:
     """Return an answer's outcome: truncated at the limit, empty without text."""
     text = text.strip()
     kind = ("truncated" if finish == "length" else "answer") if text else "empty"

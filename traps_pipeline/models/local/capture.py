@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch.nn import Module
 
 # last: the prompt's last token. answer: the first token of the model's own answer. mean: all tokens of the prompt. The
-# others: the mean over the tokens of that part (`spans`); changed and unchanged: over the visual tokens that differ
+# others: the mean over that part's tokens (`token_spans`); changed and unchanged: over the visual tokens that differ
 # between the two clips of a pair (the occluder's), and over the others.
 Pooling = Literal["last", "answer", "mean", "visual", "changed", "unchanged", "stamps", "question"]
 OF_PAIRS: tuple[Pooling, ...] = ("changed", "unchanged")

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompt_batches import Prompt, collate
+from traps_pipeline.models.local.prompt_batches import Prompt, collate_prompts
 from traps_pipeline.models.local.sampling import Sampling, SeededNucleus
 from traps_pipeline.models.reading.first_token import MAX_ALTERNATIVES
 
@@ -54,7 +54,7 @@ def decode(
     import torch
 
     transformers = load_transformers()
-    inputs: dict[str, Any] = model.placed(collate(prompts, model.network.generation_config.pad_token_id))
+    inputs: dict[str, Any] = model.placed(collate_prompts(prompts, model.network.generation_config.pad_token_id))
     first = _FirstToken()
     processors = [first, SeededNucleus(sampling)] if sampling else [first]
     with torch.inference_mode(), steering_context(steering, model):

@@ -10,13 +10,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 
 
 @cache
 def load_transformers() -> Any:
     """Return transformers, set to send nothing. Raises TrapsError if not installed."""
-    require("local")
+    require_extra("local")
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # tokenizer threads would warn at every fork

@@ -18,7 +18,7 @@ from traps_pipeline.models.local import chat_template
 from traps_pipeline.models.local.capture import Pooling, capture_states
 from traps_pipeline.models.local.decoding import Steers, decode, steering_context
 from traps_pipeline.models.local.library import load_transformers
-from traps_pipeline.models.local.prompt_batches import Prompt, batches
+from traps_pipeline.models.local.prompt_batches import Prompt, prompt_batches
 from traps_pipeline.models.local.sampling import Sampling
 from traps_pipeline.models.local.vision_cache import ClipMemory
 from traps_pipeline.models.registry.checkpoint import Checkpoint, free_bytes
@@ -231,7 +231,7 @@ class LocalModel:
         """
         answers: dict[int, GeneratedAnswer] = {}
         row_bytes = [self._row_bytes(prompt, max_new_tokens) for prompt in prompts]
-        for group in batches(prompts, row_bytes, MEMORY_SHARE * free_bytes(self.device)):
+        for group in prompt_batches(prompts, row_bytes, MEMORY_SHARE * free_bytes(self.device)):
             pending = [group]
             while pending:
                 rows = pending.pop()

@@ -50,7 +50,7 @@ class Prompt:
         return tuple((name, tuple(self.inputs[name].shape[1:])) for name in clip)
 
 
-def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
+def collate_prompts(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
     """Return one batch: pad sequences on the left, and concatenate other inputs."""
     import torch
 
@@ -65,7 +65,7 @@ def collate(prompts: Sequence[Prompt], pad_token: int) -> dict[str, Tensor]:
     return batch
 
 
-def batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
+def prompt_batches(prompts: Sequence[Prompt], row_bytes: Sequence[float], room: float) -> Iterator[list[int]]:
     """Yield batches of prompt indices: same form, like length, within `room` (bytes)."""
     rows_by_form: defaultdict[Any, list[int]] = defaultdict(list)
     for i in sorted(range(len(prompts)), key=lambda i: prompts[i].n_tokens):

@@ -31,7 +31,7 @@ _FIELDS: dict[str, tuple[Argument | None, str]] = {
 }
 
 
-def unknown_path(config: Any, block: Module) -> str | None:
+def unknown_side_path(config: Any, block: Module) -> str | None:
     """Describe a configured path that no known argument of the blocks covers, if any."""
     for field, (argument, path) in _FIELDS.items():
         if getattr(config, field, 0) and argument not in _arguments(type(block)):

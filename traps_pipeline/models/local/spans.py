@@ -26,7 +26,7 @@ CHANGED_DIFFERENCE = (
 _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 
 
-def spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict[str, np.ndarray]:
+def token_spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict[str, np.ndarray]:
     """Return, by part, whether each token of the prompt belongs to it, (T,) bool.
 
     No token belongs to two parts; those of the chat template belong to none. Raises TrapsError if a part cannot be

@@ -20,7 +20,7 @@ from traps_pipeline.models.reading.thinking import (
     strip_tokens,
     undeclared_mark,
 )
-from traps_pipeline.models.request import JUDGED, UNFINISHED, WITH_TEXT
+from traps_pipeline.models.request import JUDGED_OUTCOMES, UNFINISHED, WITH_TEXT
 from traps_pipeline.protocol.regimes import fields_of
 
 READING = "5"  # version of this module's rules; raising it makes the answers' tables stale
@@ -76,7 +76,7 @@ def read_answer(
     fragment = text[:_MAX_FRAGMENT] if isinstance(text, str) else None
     if outcome == UNFINISHED:  # this version may know the reason
         finish_reason = row.get("finish_reason")
-        outcome = {"complete": JUDGED[0], "truncated": "truncated"}.get(ending_of(finish_reason), UNFINISHED)
+        outcome = {"complete": JUDGED_OUTCOMES[0], "truncated": "truncated"}.get(ending_of(finish_reason), UNFINISHED)
         if outcome == UNFINISHED:
             why = f"ended for the unknown reason {str(finish_reason)[:_MAX_REASON]!r}"
             return Reading(outcome, None, reasoning, why=why, fragment=fragment)
@@ -105,7 +105,7 @@ def read_answer(
     if is_cut_off and not _has_final_answer(text):
         why = "cut off at the limit of tokens before a final answer"
         return Reading("truncated", None, reasoning, is_json, why, fragment)
-    return Reading(JUDGED[0], text, reasoning, is_json)
+    return Reading(JUDGED_OUTCOMES[0], text, reasoning, is_json)
 
 
 def _has_final_answer(text: str) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.paths import ROOT
 from traps_pipeline.models.registry.local_settings import SPREAD, Dtype, LocalParams, Quantisation
 
@@ -40,7 +40,7 @@ def as_folder(name: str) -> Path | None:
 
 def find_checkpoint(params: LocalParams) -> Checkpoint:
     """Return an entry's checkpoint. Raises TrapsError with the download command."""
-    require("local")
+    require_extra("local")
     folder = as_folder(params.checkpoint)
     if folder is not None:
         _require_whole(folder, params.checkpoint, f"set checkpoint: to a folder saved by save_pretrained ({folder})")

@@ -15,9 +15,9 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.keys import check_parameters
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
-from traps_pipeline.base.plugins import Group, require_known, versioned
+from traps_pipeline.base.plugins import Group, name_with_package, require_known
 from traps_pipeline.base.suggestions import did_you_mean
-from traps_pipeline.base.yamlfile import explain, parse_yaml_model, read_yaml
+from traps_pipeline.base.yamlfile import faults_of, parse_yaml_model, read_yaml
 from traps_pipeline.models.reading.thinking import Marks, marks_of
 from traps_pipeline.models.registry import user_registry
 from traps_pipeline.models.registry.accounts import Account, Groups, Limits, Prices
@@ -33,7 +33,7 @@ MODELS_FILE = Path(os.environ.get(MODELS_VARIABLE) or ASSETS / "models.yaml").ab
 # The protocol's parameters (docs/spec.md 3.1): parameter to its providers' names and its value. An entry that
 # sends something else, or nothing, says why under `waivers`.
 Protocol = Mapping[str, tuple[tuple[str, ...], Any]]
-PROTOCOL: Protocol = {
+PROTOCOL_PARAMS: Protocol = {
     "temperature": (("temperature",), 0.8),
     "top_p": (("top_p",), 0.95),
     "max_tokens": (("max_tokens", "max_completion_tokens"), 8000),
@@ -110,7 +110,7 @@ class Entry(BaseModel):
     @property
     def endpoint(self) -> str:
         """The endpoint in the ledger key: litellm's name, or the kind of backend with the package that adds it."""
-        return self.provider_id or versioned(self.plugins, self.backend)
+        return self.provider_id or name_with_package(self.plugins, self.backend)
 
     @property
     def max_tokens(self) -> int:
@@ -119,7 +119,7 @@ class Entry(BaseModel):
 
     def protocol(self) -> Protocol:
         """Return the protocol's parameters for such a participant, with names and values."""
-        return PROTOCOL
+        return PROTOCOL_PARAMS
 
     def _check_waivers(self, protocol: Protocol) -> None:
         for parameter, (names, value) in protocol.items():
@@ -199,7 +199,7 @@ class ModelEntry(Entry):
             try:
                 self.local_params()
             except ValidationError as error:
-                raise ValueError(f"params: {explain(error)}") from error
+                raise ValueError(f"params: {faults_of(error)}") from error
         elif (self.device, self.mechanism, self.size) != (None, None, None):
             raise ValueError("device, mechanism, size: only backend local has them")
 

@@ -27,7 +27,7 @@ from traps_pipeline.models.registry.entries import (
     user_registry,
     with_own,
 )
-from traps_pipeline.models.registry.prompts import prompt
+from traps_pipeline.models.registry.prompts import load_prompt
 from traps_pipeline.models.registry.schemas import structured_output
 
 JUDGES_FILE = ASSETS / "judges.yaml"
@@ -96,8 +96,8 @@ class Judge(typing.Protocol):
 
 def vote_prompt(seat: Judge, task: Task) -> str:
     """Return a task's system prompt: the paper's, and ours about the premise if asked."""
-    text = prompt(f"judge_{task}")
-    return f"{text}\n\n{prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
+    text = load_prompt(f"judge_{task}")
+    return f"{text}\n\n{load_prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
 
 
 def vote_schema(seat: Judge, task: Task) -> Mapping[str, Any]:
@@ -152,7 +152,7 @@ def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
         place = "" if path == JUDGES_FILE else f"{path}: "  # an experiment names its own file and line
         raise TrapsError(f"{place}no panel {name!r}; there are {', '.join(panels)}{did_you_mean(name, panels)}")
     seats = panels[name]
-    own_files = [file for file, own in user_registry.sources() if name in own.panels] if path == JUDGES_FILE else []
+    own_files = [file for file, own in user_registry.registries() if name in own.panels] if path == JUDGES_FILE else []
     path = own_files[-1] if own_files else path
     is_valid = isinstance(seats, list) and len(seats) == len(set(seats)) and len(seats) in PANEL_SIZES
     if not is_valid or any(seat not in judges for seat in seats):
@@ -209,7 +209,7 @@ def version_of_judges(seats: Iterable[Judge]) -> str:
     for seat in seats:
         premise_parts = [vote_prompt(seat, "abstention"), vote_schema(seat, "abstention")] if seat.premise else []
         judges.append([seat.id, seat.endpoint, dict(seat.params), SCHEMAS, *(seat.thinking or ()), *premise_parts])
-    return digest([judges, prompt("judge_abstention"), prompt("judge_correctness")])[:16]
+    return digest([judges, load_prompt("judge_abstention"), load_prompt("judge_correctness")])[:16]
 
 
 def panel_id(panel: str) -> str:

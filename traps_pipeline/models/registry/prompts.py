@@ -17,7 +17,7 @@ _SCHEMA_PARTS = {
 
 
 @cache
-def prompt(name: str) -> str:
+def load_prompt(name: str) -> str:
     """Return the text of `assets/prompts/<name>.txt`, stripped."""
     path = PROMPTS / f"{name}.txt"
     try:
@@ -33,13 +33,13 @@ def prompt(name: str) -> str:
 def system_prompt(regime: str, dataset: str = "") -> str:
     """Return a regime's system prompt, which a dataset may vary."""
     variation = (_SCHEMA_PARTS[dataset],) if dataset in _SCHEMA_PARTS else ()
-    return "\n\n".join(prompt(part) for part in (*BY_NAME[regime].texts, *variation))
+    return "\n\n".join(load_prompt(part) for part in (*BY_NAME[regime].texts, *variation))
 
 
 @cache
 def vqa_prompt(name: str) -> str:
     """Return a prompt of VQA_PROMPTS, used for hidden states (docs/spec.md 7.1)."""
-    return "\n\n".join(prompt(part) for part in BY_NAME[name].states)
+    return "\n\n".join(load_prompt(part) for part in BY_NAME[name].states)
 
 
 def prompt_version(regime: str, datasets: Iterable[str] = ()) -> str:

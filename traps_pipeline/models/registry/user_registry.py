@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
 from traps_pipeline.base.network import is_loopback
-from traps_pipeline.base.yamlfile import explain, read_yaml
+from traps_pipeline.base.yamlfile import faults_of, read_yaml
 from traps_pipeline.storage.workspace import VARIABLE, Workspace
 
 FILE = "own.yaml"
@@ -112,16 +112,16 @@ def save_entries(workspace: Workspace) -> None:
         clear_caches()
 
 
-def sources() -> list[tuple[Path, UserRegistry]]:
+def registries() -> list[tuple[Path, UserRegistry]]:
     """Return all additions, each with its file: the workspace's, the experiment's."""
     path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
     return [*([(path, _read(path))] if path else []), *_overlay]
 
 
 def all_additions() -> UserRegistry:
-    """Return the union of all `sources`."""
+    """Return the union of all `registries`."""
     registry_union = UserRegistry()
-    for _, registry in sources():
+    for _, registry in registries():
         registry_union |= registry
     return registry_union
 
@@ -133,7 +133,7 @@ def accounts() -> Mapping[str, dict[str, Any]]:
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
     """Return the added models or judges, completed, each with its file."""
-    newest_of = {raw["id"]: (path, raw) for path, registry in sources() for raw in getattr(registry, kind)}
+    newest_of = {raw["id"]: (path, raw) for path, registry in registries() for raw in getattr(registry, kind)}
     return ((path, _entry_fields(raw, kind)) for path, raw in newest_of.values())
 
 
@@ -141,7 +141,7 @@ def _read(path: Path) -> UserRegistry:
     try:
         return UserRegistry.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        raise TrapsError(f"{path}: {explain(error, UserRegistry)}") from error
+        raise TrapsError(f"{path}: {faults_of(error, UserRegistry)}") from error
 
 
 def _yaml(registry: UserRegistry) -> str:

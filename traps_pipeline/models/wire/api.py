@@ -14,7 +14,7 @@ from importlib.metadata import version
 from typing import Any
 
 from traps_pipeline.base import progress
-from traps_pipeline.base.extras import require
+from traps_pipeline.base.extras import require_extra
 from traps_pipeline.base.redaction import redact
 from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
@@ -67,8 +67,8 @@ TRANSIENT_STATUSES = {408: "timeout", 409: "conflict", 429: RATE_LIMITED}
 @cache
 def load_litellm() -> Any:
     """Return litellm, set to send and fetch nothing itself. Raises TrapsError."""
-    require("api")
-    from traps_pipeline.models.wire.httpx_transport import use_in
+    require_extra("api")
+    from traps_pipeline.models.wire.httpx_transport import use_transport_in
 
     os.environ["LITELLM_MODE"] = "PRODUCTION"  # otherwise it loads a .env file from any folder above
     os.environ["LITELLM_LOCAL_MODEL_COST_MAP"] = "True"
@@ -81,7 +81,7 @@ def load_litellm() -> Any:
     litellm.suppress_debug_info = True
     litellm.drop_params = False  # a parameter that a provider refuses is an error, never silently dropped
     litellm.callbacks = [_hook()]
-    use_in(import_module("litellm.llms.custom_httpx.http_handler").AsyncHTTPHandler)
+    use_transport_in(import_module("litellm.llms.custom_httpx.http_handler").AsyncHTTPHandler)
     # Its import opens unwatched connections, and keeps them for callers with the same time-out.
     litellm.in_memory_llm_clients_cache.flush_cache()
     return litellm

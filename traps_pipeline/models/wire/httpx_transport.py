@@ -1,8 +1,8 @@
 """Send all calls out of this machine by an httpx transport that records them.
 
-`use_in` makes litellm's clients use it on every route. Each attempt's `Exchange` records whether its request was sent,
-the status of the answer, and the answer's bytes. Loopback addresses bypass proxies, redirects are not followed, an
-attempt sends one request at most, an answer is read up to a bound, and no compression is requested.
+`use_transport_in` makes litellm's clients use it on every route. Each attempt's `Exchange` records whether its request
+was sent, the status of the answer, and the answer's bytes. Loopback addresses bypass proxies, redirects are not
+followed, an attempt sends one request at most, an answer is read up to a bound, and no compression is requested.
 """
 
 import asyncio
@@ -239,7 +239,7 @@ def cause_of(error: BaseException) -> str:
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
-def use_in(handler: Any) -> None:
+def use_transport_in(handler: Any) -> None:
     """Make every client that litellm creates from now on send through a `Wire`.
 
     handler: its class AsyncHTTPHandler, from which both its own client and the one for OpenAI's library get their
@@ -252,7 +252,7 @@ def use_in(handler: Any) -> None:
     handler.create_async_transport = staticmethod(create)
 
 
-def get(url: str, headers: Mapping[str, str], timeout_s: float) -> httpx.Response:
+def get_url(url: str, headers: Mapping[str, str], timeout_s: float) -> httpx.Response:
     """Return the answer to a GET, outside of event loops. Raises TrapsError if none."""
 
     async def answer() -> httpx.Response:

@@ -16,7 +16,7 @@ from traps_pipeline.benchmark.specs import (
 )
 from traps_pipeline.pipeline.graph import Check, ConcurrentBuild, RunResources
 from traps_pipeline.pipeline.schemes import CATEGORY, DATASET, to_keys
-from traps_pipeline.pipeline.stage import is_declared, of, source, stage
+from traps_pipeline.pipeline.stage import dep, is_declared, source, stage
 from traps_pipeline.protocol.datasets import all_datasets_of, arms_of_category, sides_of
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.parquet import StageOutput
@@ -215,9 +215,9 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
 @_stage(
     ITEMS,
     parents=[
-        of(scene_specs, category_to_datasets),
-        of(videos, category_to_datasets),
-        *([of(arms, category_to_arms)] if is_declared("arms") else []),
+        dep(scene_specs, category_to_datasets),
+        dep(videos, category_to_datasets),
+        *([dep(arms, category_to_arms)] if is_declared("arms") else []),
     ],
     scheme=DATASET,
     checks=[

@@ -14,11 +14,11 @@ from traps_pipeline.models.reading.judged_answers import UNREAD
 from traps_pipeline.models.registry.entries import answering_version
 from traps_pipeline.models.registry.judges import panel_version
 from traps_pipeline.models.registry.prompts import prompt_version
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Records, StudyFile
 from traps_pipeline.pipeline.schemes import CELL, EVALUATION, by_dataset, by_evaluation
-from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stage import dep, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.benchmark_tables import ITEMS
@@ -63,7 +63,7 @@ def _items_shown(workspace: Workspace, cell: Cell, rows: Sequence[ResponseRow | 
     """Return metadata: items without an answer, and the explorer's view of all."""
     view = answers_view(dataset=cell.dataset, model=cell.evaluation.model, regime=cell.evaluation.regime)
     columns = ("item_id", "side", "outcome", "error", "attempts")
-    unanswered = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED]
+    unanswered = [row for row in rows if isinstance(row, ResponseRow) and row.outcome not in JUDGED_OUTCOMES]
     records = [{name: str(getattr(row, name)) for name in columns} for row in unanswered[:ITEMS_SHOWN]]
     table = {"without an answer": Records(records)} if records else {}
     reason = {"one item": f"traps why {rows[0].item_id}"} if rows else {}
@@ -78,7 +78,7 @@ def _answers_missing(workspace: Workspace, key: str | None, output: StageOutput)
 
 @_stage(
     RESPONSES,
-    parents=[of(items, by_dataset), of(models, by_evaluation), of(prompts, by_evaluation)],
+    parents=[dep(items, by_dataset), dep(models, by_evaluation), dep(prompts, by_evaluation)],
     code=f"3.{READING}",
     cost="money",
     checks=[Check("one_answer_an_item", "Every item of the cell has exactly one row.", _answers_missing)],
@@ -100,7 +100,7 @@ def _excess_of_invalid(workspace: Workspace, key: str | None, output: StageOutpu
 
 @_stage(
     VOTES,
-    parents=[of(items, by_dataset), responses, judges],
+    parents=[dep(items, by_dataset), responses, judges],
     code="5",
     cost="money",
     checks=[
@@ -130,7 +130,7 @@ def _verdicts_missing(workspace: Workspace, key: str | None, output: StageOutput
 
 @_stage(
     VERDICTS,
-    parents=[of(items, by_dataset), responses, votes, judges],
+    parents=[dep(items, by_dataset), responses, votes, judges],
     code="4",
     checks=[Check("one_verdict_an_item", "Every answered item has exactly one verdict.", _verdicts_missing)],
     side_by_side=True,

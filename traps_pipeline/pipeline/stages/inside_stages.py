@@ -9,7 +9,7 @@ from traps_pipeline.mechanism.probing_versions import patching_version, sentence
 from traps_pipeline.models.registry.entries import ModelEntry, local_models
 from traps_pipeline.pipeline.partitioning import EVERY, SAME
 from traps_pipeline.pipeline.schemes import CELL, EXTRACTION, PROBED, by_extraction, these_keys, to_keys
-from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stage import dep, source, stage
 from traps_pipeline.pipeline.stages.evaluation_stages import responses, verdicts
 from traps_pipeline.pipeline.stages.mechanism_stages import (
     ANSWERED_CELLS,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _source = partial(source, group=GROUP, kinds=["yaml"], scheme=EXTRACTION)
 _stage = partial(stage, group=GROUP, scheme=EXTRACTION, cost="machine")
-_STATES = of(hidden_states, by_extraction, need="some")
+_STATES = dep(hidden_states, by_extraction, need="some")
 _ANSWERED_DATASETS = (*DATASETS, *PROBED_ARMS)
 _GATED = these_keys(
     CELL, [Cell(d, Evaluation(m, r, 1)).key for d in _ANSWERED_DATASETS for m in local_models() for r in PROMPTING]
@@ -48,8 +48,8 @@ def _with_random(key: str) -> list[str]:
 
 _COMPARED = [
     _STATES,  # those of random weights are upstream of their probes
-    of(probes, to_keys(EXTRACTION, EXTRACTION, _with_random), need="some"),
-    of(probe_items, EVERY),
+    dep(probes, to_keys(EXTRACTION, EXTRACTION, _with_random), need="some"),
+    dep(probe_items, EVERY),
     probing_settings,
 ]
 
@@ -87,7 +87,7 @@ def _is_trained(_: StudyPartitions, key: str) -> bool:
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
     code="3",
-    parents=[_STATES, of(probe_items, EVERY), of(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
+    parents=[_STATES, dep(probe_items, EVERY), dep(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
     wants=lambda study, key: _is_trained(study, key) and Extraction.parse(key).prompt in study.probed_prompts,
 )
@@ -108,7 +108,7 @@ def _is_gated(partitions: StudyPartitions, key: str) -> bool:
 _gates = partial(
     _stage,
     code="3",
-    parents=[*_COMPARED, of(verdicts, _GATED, need="some")],
+    parents=[*_COMPARED, dep(verdicts, _GATED, need="some")],
     wants=_is_gated,
 )
 
@@ -155,8 +155,8 @@ def _with_two_events(key: str) -> list[str]:
     tables.INTERACTION,
     parents=[
         _STATES,
-        of(probes, to_keys(EXTRACTION, EXTRACTION, _with_two_events), need="some"),
-        of(probe_items, these_keys(PROBED, [TWO_EVENTS])),
+        dep(probes, to_keys(EXTRACTION, EXTRACTION, _with_two_events), need="some"),
+        dep(probe_items, these_keys(PROBED, [TWO_EVENTS])),
         probing_settings,
     ],
     wants=lambda study, key: StatesCell(TWO_EVENTS, Extraction.parse(key)).key in study.states,
@@ -171,7 +171,7 @@ def interaction(workspace: Workspace, key: str) -> StageOutput:
 @_stage(
     tables.ITEM_SCORES,
     code="2",
-    parents=[_STATES, of(probes, SAME), of(verdicts, _GATED, need="none"), probing_settings],
+    parents=[_STATES, dep(probes, SAME), dep(verdicts, _GATED, need="none"), probing_settings],
     wants=_is_gated,
 )
 def item_scores(workspace: Workspace, key: str) -> StageOutput:
@@ -190,7 +190,7 @@ def _has_sentences(partitions: StudyPartitions, key: str) -> bool:
 @_stage(
     tables.SENTENCES,
     code="2",
-    parents=[of(probe_items, EVERY, need="some"), of(responses, _GATED, need="some"), sentence_settings],
+    parents=[dep(probe_items, EVERY, need="some"), dep(responses, _GATED, need="some"), sentence_settings],
     wants=_has_sentences,
 )
 def sentences(workspace: Workspace, key: str) -> StageOutput:
@@ -202,7 +202,7 @@ def sentences(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(
     tables.PATCHING,
-    parents=[of(probe_items, EVERY, need="some"), patching_settings],
+    parents=[dep(probe_items, EVERY, need="some"), patching_settings],
     wants=lambda study, key: study.patched_prompt == Extraction.parse(key).prompt,
     kinds=["parquet", "pytorch"],
 )

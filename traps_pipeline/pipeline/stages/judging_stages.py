@@ -10,7 +10,7 @@ from traps_pipeline.judging.judging_rows import AGREEMENT, CONFABULATION, JUDGE_
 from traps_pipeline.models.registry.judges import load_panel, panel_id
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.schemes import CELL, these_keys
-from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stage import dep, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import MAX_INVALID_SHARE, judges, responses, verdicts, votes
 from traps_pipeline.pipeline.stages.scoring_stages import has_pairs, leaderboard
@@ -55,7 +55,7 @@ def _votes(workspace: Workspace, name: str) -> "pd.DataFrame":
     return cast
 
 
-_VOTED = (of(items, need="some"), of(votes, need="some"), judges)
+_VOTED = (dep(items, need="some"), dep(votes, need="some"), judges)
 
 
 @_stage(AGREEMENT, parents=_VOTED, wants=has_pairs)
@@ -74,7 +74,7 @@ def judge_bias(workspace: Workspace, _: None) -> "pd.DataFrame":
     return rows_of(_votes(workspace, "judge_bias"), _panel(workspace))
 
 
-@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, of(verdicts, need="some"), leaderboard], wants=has_pairs)
+@_stage(LEAVE_ONE_OUT, parents=[*_VOTED, dep(verdicts, need="some"), leaderboard], wants=has_pairs)
 def leave_one_out(workspace: Workspace, _: None) -> "pd.DataFrame":
     """Return PECS by the votes of two judges, for each judge left out."""
     from traps_pipeline.scoring.leave_one_out import leave_one_out as rows_of
@@ -96,9 +96,9 @@ _SAMPLED = these_keys(CELL, [c.key for m in load_protocol().models for c in load
 @_stage(
     CONFABULATION,
     parents=[
-        of(items, need="none"),
-        of(responses, _SAMPLED, need="none"),
-        of(verdicts, _SAMPLED, need="none"),
+        dep(items, need="none"),
+        dep(responses, _SAMPLED, need="none"),
+        dep(verdicts, _SAMPLED, need="none"),
         confabulation_protocol,
     ],
     code="4",

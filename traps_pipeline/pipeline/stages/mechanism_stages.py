@@ -38,7 +38,7 @@ from traps_pipeline.pipeline.schemes import (
     these_keys,
     to_keys,
 )
-from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stage import dep, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items, scene_specs, videos
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, verdicts
 from traps_pipeline.pipeline.wanted import StudyPartitions
@@ -84,9 +84,9 @@ def steers(partitions: StudyPartitions, key: str | None) -> bool:
     PROBE_ITEMS,
     code="3",
     parents=[
-        of(items, to_keys(DATASET, PROBED, lambda dataset: [dataset])),
-        of(scene_specs, _OCCLUSION),
-        of(videos, _OCCLUSION),
+        dep(items, to_keys(DATASET, PROBED, lambda dataset: [dataset])),
+        dep(scene_specs, _OCCLUSION),
+        dep(videos, _OCCLUSION),
     ],
     scheme=PROBED,
 )
@@ -108,7 +108,7 @@ def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) 
 
 @_stage(
     HIDDEN_STATES,
-    parents=[of(probe_items, by_dataset), of(extraction_settings, by_extraction)],
+    parents=[dep(probe_items, by_dataset), dep(extraction_settings, by_extraction)],
     scheme=schemes.STATES,
     kinds=["parquet", "pytorch"],
     cost="machine",
@@ -138,8 +138,8 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     PROBES,
     code="3",
     parents=[
-        of(hidden_states, by_extraction, need="some"),
-        of(verdicts, ANSWERED_CELLS, need="none"),
+        dep(hidden_states, by_extraction, need="some"),
+        dep(verdicts, ANSWERED_CELLS, need="none"),
         probing_settings,
     ],
     scheme=EXTRACTION,
@@ -158,7 +158,7 @@ def probes(workspace: Workspace, key: str) -> StageOutput:
 @_stage(
     DIRECTIONS,
     code="3",
-    parents=[of(hidden_states, by_extraction, need="some"), probing_settings],
+    parents=[dep(hidden_states, by_extraction, need="some"), probing_settings],
     scheme=EXTRACTION,
     wants=steers,
     lost=lambda workspace, key: (
@@ -172,7 +172,7 @@ def directions(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(direction_rows(workspace, Extraction.parse(key)))
 
 
-@_stage(COSINES, code="2", parents=[of(directions, need="some"), of(hidden_states, need="some")], wants=steers)
+@_stage(COSINES, code="2", parents=[dep(directions, need="some"), dep(hidden_states, need="some")], wants=steers)
 def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
     """Return cosines, with reliability, of a model's void directions at one layer."""
     from traps_pipeline.mechanism.cosines import cosine_rows
@@ -183,7 +183,7 @@ def cosines(workspace: Workspace, _: None) -> list[CosineRow]:
 @_stage(
     STEERING_TABLE,
     code="5",
-    parents=[of(items, by_dataset), of(directions, EVERY, need="some"), of(steering_settings, schemes.by_steering)],
+    parents=[dep(items, by_dataset), dep(directions, EVERY, need="some"), dep(steering_settings, schemes.by_steering)],
     scheme=schemes.STEERING,
     kinds=["parquet", "pytorch"],
     cost="machine",
@@ -205,7 +205,7 @@ def steering(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[str | 
 @_stage(
     STEERING_VOTES,
     code="5",
-    parents=[of(items, by_dataset), steering, judges],
+    parents=[dep(items, by_dataset), steering, judges],
     scheme=schemes.STEERING,
     cost="money",
     side_by_side=True,
@@ -220,7 +220,7 @@ def steering_votes(workspace: Workspace, keys: Sequence[str]) -> Iterator[tuple[
 
 @_stage(
     STEERING_FLUENCY,
-    parents=[of(items, by_dataset), steering],
+    parents=[dep(items, by_dataset), steering],
     scheme=schemes.STEERING,
     kinds=["parquet", "pytorch"],
     cost="machine",
@@ -241,10 +241,10 @@ def _answers_and_votes(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFram
     return workspace.tables.read_all(STEERING_TABLE), workspace.tables.read_all(STEERING_VOTES, VOTE_COLUMNS)
 
 
-_STEERING_PARENTS = (of(steering, need="some"), of(steering_votes, need="some"))
+_STEERING_PARENTS = (dep(steering, need="some"), dep(steering_votes, need="some"))
 
 
-@_stage(STEERING_EFFECTS, code="4", parents=(*_STEERING_PARENTS, of(steering_fluency, need="some")), wants=steers)
+@_stage(STEERING_EFFECTS, code="4", parents=(*_STEERING_PARENTS, dep(steering_fluency, need="some")), wants=steers)
 def steering_effects(workspace: Workspace, _: None) -> list[SteeringEffectRow]:
     """Return abstention by path, kind of direction, layer, strength and side."""
     from traps_pipeline.mechanism.shares import effect_rows

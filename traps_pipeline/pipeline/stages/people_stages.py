@@ -8,7 +8,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, PROTOCOL_FILE, labels_version
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
-from traps_pipeline.pipeline.stage import of, source, stage
+from traps_pipeline.pipeline.stage import dep, source, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts
 from traps_pipeline.pipeline.stages.judging_stages import confabulation
@@ -38,7 +38,7 @@ def annotation_protocol(workspace: Workspace, _: None) -> str:
     return file_digest(PROTOCOL_FILE)[:16]
 
 
-_LABELLED = tuple(of(one, need="none") for one in (items, responses, verdicts, confabulation))
+_LABELLED = tuple(dep(one, need="none") for one in (items, responses, verdicts, confabulation))
 
 
 @_stage(HUMAN_LABELS, parents=[*_LABELLED, people, annotation_protocol, judges])
@@ -76,7 +76,7 @@ def _labels_and_verdicts(workspace: Workspace) -> "tuple[pd.DataFrame, pd.DataFr
     return labels, panel_verdicts.reset_index(drop=True)
 
 
-_VALIDATION_PARENTS = (human_labels, of(verdicts, need="none"), judges)
+_VALIDATION_PARENTS = (human_labels, dep(verdicts, need="none"), judges)
 
 
 @_stage(PANEL_ERRORS, parents=_VALIDATION_PARENTS)

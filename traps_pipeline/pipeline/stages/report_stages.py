@@ -5,7 +5,7 @@ from functools import partial
 from traps_pipeline.pipeline.graph import Parent
 from traps_pipeline.pipeline.pieces import Piece, make_pieces
 from traps_pipeline.pipeline.previews import Markdown
-from traps_pipeline.pipeline.stage import code_of, is_declared, of, source, stage
+from traps_pipeline.pipeline.stage import code_of, dep, is_declared, source, stage
 from traps_pipeline.pipeline.stages import judging_stages, people_stages, scoring_stages
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, TABLE_REPORTS
 from traps_pipeline.scoring.published import published_digest
@@ -29,7 +29,7 @@ def published(workspace: Workspace, _: None) -> str:
 
 
 def _parents(*names: str) -> list[Parent]:
-    return [of(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
+    return [dep(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
 
 
 @_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
@@ -41,7 +41,7 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
     """
     from traps_pipeline.report.cards import Card, Sources
     from traps_pipeline.report.printed_board import BOARD_FILE, board_bytes, board_tables
-    from traps_pipeline.report.publish import MARKDOWN, PAPER, report_files, report_parts
+    from traps_pipeline.report.publish import MARKDOWN, PAPER_CHAPTER, report_files, report_parts
 
     sources = Sources(workspace)
     parts = report_parts(sources)
@@ -51,7 +51,7 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
             lambda p=p: p.make().data,
             (*p.reads, "published", *(("human_row",) if sources.study.certified else ())),
             p.inputs,
-            is_shared=p.chapter == PAPER,
+            is_shared=p.chapter == PAPER_CHAPTER,
         )
         for p in parts
     ]

@@ -11,7 +11,7 @@ from traps_pipeline.judging.judging_rows import VERDICTS, VOTES
 from traps_pipeline.pipeline.graph import Check
 from traps_pipeline.pipeline.previews import Markdown, rows_shown
 from traps_pipeline.pipeline.schemes import DATASET, by_dataset
-from traps_pipeline.pipeline.stage import SHARED_IN_RUN, is_declared, of, stage
+from traps_pipeline.pipeline.stage import SHARED_IN_RUN, dep, is_declared, stage
 from traps_pipeline.pipeline.stages.benchmark_stages import arms, items
 from traps_pipeline.pipeline.stages.evaluation_stages import judges, responses, verdicts, votes
 from traps_pipeline.pipeline.wanted import StudyPartitions
@@ -55,7 +55,7 @@ def _zero_check(find: str, noun: str) -> Callable[[Workspace, str | None, StageO
 
 @_stage(
     METRICS,
-    parents=[items, of(verdicts, by_dataset, need="some"), judges],
+    parents=[items, dep(verdicts, by_dataset, need="some"), judges],
     scheme=DATASET,
     checks=[
         Check(
@@ -96,7 +96,7 @@ def _bootstrap_of(judged: "pd.DataFrame") -> "ResampledFigures":
 
 # The panel is an input of everything computed from its verdicts, so that a change of panel makes them stale at once,
 # not only after the new votes.
-_SCORED = (of(metrics, need="some"), of(verdicts, need="some"), judges)
+_SCORED = (dep(metrics, need="some"), dep(verdicts, need="some"), judges)
 
 
 @_stage(CONTRASTS, parents=_SCORED, wants=has_pairs)
@@ -147,7 +147,7 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
 
 @_stage(
     TWO_WAY,
-    parents=[of(verdicts, need="some"), judges],
+    parents=[dep(verdicts, need="some"), judges],
     checks=[
         Check(
             "two_way_rows_hold",
@@ -168,7 +168,7 @@ def two_way(workspace: Workspace, _: None) -> "pd.DataFrame":
 
 @_stage(
     HYPOTHESES,
-    parents=[of(items, need="some"), *_SCORED],
+    parents=[dep(items, need="some"), *_SCORED],
     checks=[
         Check(
             "doses_hold",
@@ -194,8 +194,8 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
 @_stage(
     GRADED_CUTS,
     parents=[
-        *([of(arms, need="none")] if is_declared("arms") else []),
-        *(of(parent, need="some") for parent in (items, responses, votes, verdicts)),
+        *([dep(arms, need="none")] if is_declared("arms") else []),
+        *(dep(parent, need="some") for parent in (items, responses, votes, verdicts)),
         judges,
     ],
     checks=[

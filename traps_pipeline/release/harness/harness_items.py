@@ -29,7 +29,7 @@ def media_of(item: dict[str, Any]) -> list[Path]:
     return [FOLDER / name for name in item["media"]]
 
 
-def prompt(regime: str) -> str:
+def harness_prompt(regime: str) -> str:
     """Return a regime's system prompt. Raises ValueError with the known regimes."""
     prompts: dict[str, str] = about()["prompts"]
     if regime not in prompts:

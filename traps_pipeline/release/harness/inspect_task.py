@@ -11,8 +11,8 @@ from inspect_ai.model import ChatMessageSystem, ChatMessageUser, ContentImage, C
 from inspect_ai.scorer import Score, metric, scorer
 from inspect_ai.solver import generate
 
-from traps_pipeline.release.harness.harness_items import about, items, media_of, prompt
-from traps_pipeline.release.harness.scoring import PanelDecision, figures, judge
+from traps_pipeline.release.harness.harness_items import about, harness_prompt, items, media_of
+from traps_pipeline.release.harness.scoring import PanelDecision, judge, run_metrics
 
 _OUTCOMES = {"max_tokens": "truncated", "model_length": "truncated", "content_filter": "refused"}
 
@@ -25,7 +25,7 @@ def traps(regime: str = "standard") -> Any:
 
 def evaluation(regime: str) -> Any:
     """Return a task with all items under a regime, once; each run is an evaluation."""
-    system = prompt(regime)
+    system = harness_prompt(regime)
     samples = [
         Sample(
             id=item["item_id"],
@@ -62,7 +62,7 @@ def traps_figures() -> Any:
     """Return the metric: PECS and its factors, overall and by dataset, and the figures of two events."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
-        results = figures(PanelDecision.of(score.score.metadata) for score in scores)
+        results = run_metrics(PanelDecision.of(score.score.metadata) for score in scores)
         return {name: value for name, value in results.items() if value is not None}
 
     return compute

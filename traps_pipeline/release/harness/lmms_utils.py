@@ -11,8 +11,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # lmms-eval loads this file alone, from any folder
 
-from traps_pipeline.release.harness.harness_items import media_of, prompt
-from traps_pipeline.release.harness.scoring import RUN_FIGURES, TWO_WAY_FIGURES, PanelDecision, figures, judge
+from traps_pipeline.release.harness.harness_items import harness_prompt, media_of
+from traps_pipeline.release.harness.scoring import RUN_METRICS, TWO_WAY_METRICS, PanelDecision, judge, run_metrics
 
 
 def doc_to_visual(doc: dict[str, Any]) -> list[Any]:
@@ -32,7 +32,7 @@ def doc_to_target(doc: dict[str, Any]) -> str:
 
 def _text(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> str:
     """Return system prompt and question as one text, for models without the former."""
-    return f"{prompt(regime)}\n\n{doc['question']}"
+    return f"{harness_prompt(regime)}\n\n{doc['question']}"
 
 
 def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, regime: str) -> list[dict[str, Any]]:
@@ -41,7 +41,7 @@ def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, reg
     kind = "video" if isinstance(visuals[0], str) else "image"
     content = [{"type": kind, "url": visual} for visual in visuals]
     return [
-        {"role": "system", "content": [{"type": "text", "text": prompt(regime)}]},
+        {"role": "system", "content": [{"type": "text", "text": harness_prompt(regime)}]},
         {"role": "user", "content": [*content, {"type": "text", "text": doc["question"]}]},
     ]
 
@@ -53,10 +53,10 @@ def _results(doc: dict[str, Any], results: list[str], *, regime: str) -> dict[st
 
 
 def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
-    return figures(PanelDecision.of(row) for row in rows).get(name)
+    return run_metrics(PanelDecision.of(row) for row in rows).get(name)
 
 
-NAMES = (*RUN_FIGURES, *TWO_WAY_FIGURES, "missing", "unread")
+NAMES = (*RUN_METRICS, *TWO_WAY_METRICS, "missing", "unread")
 _BY_REGIME = {"text": _text, "messages": _messages, "results": _results}  # a task of a regime names `REGIME_text`
 
 

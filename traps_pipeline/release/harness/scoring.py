@@ -10,13 +10,13 @@ from typing import Any
 from traps_pipeline.judging.rules import read_statement
 from traps_pipeline.models.reading.interpret import read_answer
 from traps_pipeline.models.reading.judged_answers import UNREAD, is_correct
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.protocol.two_events import lane_item, lane_items
 
 DATASETS = ("chaotic", "chaotic_ill_posed", "occlusion", "occlusion_ill_posed")  # means are summed in this order
-RUN_FIGURES = ("pecs", "acc", "abs_rec", "false_abs", "j")
-TWO_WAY_FIGURES = ("conjunction", "own_effect", "other_effect", "specificity")
+RUN_METRICS = ("pecs", "acc", "abs_rec", "false_abs", "j")
+TWO_WAY_METRICS = ("conjunction", "own_effect", "other_effect", "specificity")
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
     row = {"outcome": outcome if (text or "").strip() or outcome not in ("answer", "truncated") else "empty"}
     reading = read_answer({**row, "text": text}, None, regime)
     names = {name: item[name] for name in ("item_id", "dataset", "side")}
-    if reading.outcome not in JUDGED or reading.text is None:
+    if reading.outcome not in JUDGED_OUTCOMES or reading.text is None:
         return PanelDecision(**names, outcome=reading.outcome)
     statement = read_statement(reading.text, item["question"])
     if statement is None:
@@ -67,11 +67,11 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
     return PanelDecision(**names, outcome=reading.outcome, abstained=abstained, correct=correct)
 
 
-def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
+def run_metrics(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     """Return Acc, AbsRec, FalseAbs, J and PECS of one run.
 
     Keys: `DATASET_FIGURE` for each dataset, and FIGURE overall, the equal-weight mean over the four datasets, None
-    unless all four are present; TWO_WAY_FIGURES if two events were asked; `missing`, the number of undecided items, and
+    unless all four are present; TWO_WAY_METRICS if two events were asked; `missing`, the number of undecided items, and
     `unread`, those among them that the rules could not read.
     """
     rows = list(judged)
@@ -79,8 +79,8 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     figures_of = {name: _dataset_figures([row for row in rows if row.dataset == name]) for name in DATASETS}
     for name, dataset_figures in figures_of.items():
         if any(row.dataset == name for row in rows):
-            results |= {f"{name}_{figure}": dataset_figures[figure] for figure in RUN_FIGURES}
-    for figure in RUN_FIGURES:
+            results |= {f"{name}_{figure}": dataset_figures[figure] for figure in RUN_METRICS}
+    for figure in RUN_METRICS:
         values = [dataset_figures[figure] for dataset_figures in figures_of.values()]
         values_present = [value for value in values if value is not None]
         results[figure] = sum(values_present) / len(DATASETS) if len(values_present) == len(DATASETS) else None
@@ -93,7 +93,7 @@ def figures(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
 
 
 def _two_way_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
-    """Return TWO_WAY_FIGURES (`scoring.two_way`); none without rows."""
+    """Return TWO_WAY_METRICS (`scoring.two_way`); none without rows."""
     if not rows:
         return {}
     cells: dict[tuple[bool, bool], list[bool | None]] = {}  # by whether the asked and the other event is hidden
@@ -108,7 +108,7 @@ def _two_way_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
     neither, other, asked = (_share(cells.get(cell, [])) for cell in ((False, False), (False, True), (True, False)))
     pairs = ((asked, neither), (other, neither), (asked, other))
     effects = [None if high is None or low is None else high - low for high, low in pairs]
-    return dict(zip(TWO_WAY_FIGURES, (_share(conjunctions), *effects), strict=True))
+    return dict(zip(TWO_WAY_METRICS, (_share(conjunctions), *effects), strict=True))
 
 
 def _dataset_figures(rows: list[PanelDecision]) -> dict[str, float | None]:

@@ -14,7 +14,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes, write_text
 from traps_pipeline.base.yamlfile import read_lines
-from traps_pipeline.models.registry.entries import PROTOCOL
+from traps_pipeline.models.registry.entries import PROTOCOL_PARAMS
 from traps_pipeline.models.registry.judges import RULES_PANEL, panel_id
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
@@ -23,7 +23,7 @@ from traps_pipeline.release.checksums import altered_files
 from traps_pipeline.release.content import CLIPS, SYSTEM
 from traps_pipeline.release.folder import MANIFEST
 from traps_pipeline.release.harness.harness_items import ABOUT, ITEMS, MEDIA
-from traps_pipeline.release.harness.scoring import TWO_WAY_FIGURES
+from traps_pipeline.release.harness.scoring import TWO_WAY_METRICS
 from traps_pipeline.storage.media import MediaSpec, MediaStore, payload
 
 PACKAGE, LMMS = "traps_harness", "lmms"
@@ -76,7 +76,7 @@ def write_harness(release: Path, target: Path, media: MediaSpec = MEDIA_SETTINGS
         "panel": panel_id(RULES_PANEL),
         "media": media.model_dump(mode="json", exclude_none=True),
         "prompts": {row["name"]: row["text"] for row in prompts if row["role"] == SYSTEM and _is_of_text(row["name"])},
-        "parameters": {name: value for name, (_, value) in PROTOCOL.items()},
+        "parameters": {name: value for name, (_, value) in PROTOCOL_PARAMS.items()},
         "items": digest(sorted(items)),
     }
     write_text(package / ABOUT, json.dumps(description, indent=1, ensure_ascii=False) + "\n")
@@ -193,9 +193,9 @@ def _lmms(target: Path, about: Mapping[str, Any]) -> None:
                 {
                     "metric": f"traps_{name}",
                     "aggregation": _Function(f"utils.{name}"),
-                    "higher_is_better": name in (*METRIC_WORDS, *TWO_WAY_FIGURES) and name not in less_is_better,
+                    "higher_is_better": name in (*METRIC_WORDS, *TWO_WAY_METRICS) and name not in less_is_better,
                 }
-                for name in (*METRIC_WORDS, *TWO_WAY_FIGURES, "missing", "unread")
+                for name in (*METRIC_WORDS, *TWO_WAY_METRICS, "missing", "unread")
             ],
             "metadata": [{"version": about["version"], "canary": about["canary"]}],
         }

@@ -26,7 +26,7 @@ from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.held_out import begin_publication
 from traps_pipeline.benchmark.records import load_release
-from traps_pipeline.models.request import JUDGED
+from traps_pipeline.models.request import JUDGED_OUTCOMES
 from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.people.recorded_certificates import certification_note, recorded_verdicts
 from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, UNPAIRED, sides_of
@@ -41,7 +41,7 @@ from traps_pipeline.report.published_results import PublishedResults
 from traps_pipeline.report.tables.human_tables import people_notes
 from traps_pipeline.report.tables.table_columns import entries
 from traps_pipeline.report.tables.two_way_table import two_way_table
-from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLES
+from traps_pipeline.report.terms import ARM_TITLES, MARKS, TITLE_OF
 from traps_pipeline.report.writing import environment
 from traps_pipeline.scoring.analyses import REASONING_PAIRS, SHARES
 from traps_pipeline.scoring.score_rows import CONTRASTS, LEADERBOARD, REGIME_TESTS, TWO_WAY
@@ -215,13 +215,13 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "benchmark": f"{release.name} {release.version}",
         "provenance": provenance(board) if len(board) else "",
         "has_clips": has_clips,
-        "datasets": [{"id": d, "title": {**TITLES, **ARM_TITLES}[d], "sides": [*sides_of(d)]} for d in datasets],
-        "titles": TITLES,
+        "datasets": [{"id": d, "title": {**TITLE_OF, **ARM_TITLES}[d], "sides": [*sides_of(d)]} for d in datasets],
+        "titles": TITLE_OF,
         "regimes": [name for name in REGIMES if name in {e.regime for e in answers.evaluations}],
         "models": [{"id": m, "group": registry[m].groups.group if m in registry else unknown} for m in models],
         "evaluations": evaluations,
         "outcomes": [*answers.outcomes],
-        "judged": [*JUDGED],
+        "judged": [*JUDGED_OUTCOMES],
         "epochs": [*answers.epochs],
         "shards": shards,
         "n_votes": len(answers.votes),

@@ -9,9 +9,9 @@ import numpy as np
 from traps_pipeline.models.registry.entries import is_reference
 from traps_pipeline.protocol.datasets import taxonomy_of
 from traps_pipeline.protocol.regimes import PROMPTING
-from traps_pipeline.report.figures.looks import REFERENCE, families, family_colour, family_of, legend_key, looks
+from traps_pipeline.report.figures.looks import REFERENCE, family_colour, family_order, legend_key, looks, model_family
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
+from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLE_OF
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 from traps_pipeline.scoring import analyses
 
@@ -65,11 +65,11 @@ def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
     """Draw both rates as means over a family's models."""
     averaged_rates = rates.loc[_average(rates)]
     means = (
-        averaged_rates.assign(family=averaged_rates["model"].map(family_of))
+        averaged_rates.assign(family=averaged_rates["model"].map(model_family))
         .groupby("family")[["visual", "textual"]]
         .mean()
     )
-    names = [name for name in families() if name in means.index]
+    names = [name for name in family_order() if name in means.index]
     at = np.arange(len(names))
     for k, (kind, hatch) in enumerate((("visual", ""), ("textual", "/////"))):
         bars = axes.bar(
@@ -197,7 +197,7 @@ def doubt_points(results: Results) -> tuple[pd.DataFrame, str]:
         if len(epochs) > 1:
             refusals.append(f"{thinking}: doubt and AbsRec are of epochs {', '.join(sorted(epochs))}")
             continue
-        for dataset in TITLES:
+        for dataset in TITLE_OF:
             taxonomy, kind = taxonomy_of(dataset), "textual" if dataset.endswith("_ill_posed") else "visual"
             if all(taxonomy in side.index for side in sides.values()):
                 gain = sides[thinking].at[taxonomy, kind] - sides[base].at[taxonomy, kind]

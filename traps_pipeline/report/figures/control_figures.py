@@ -9,7 +9,7 @@ import numpy as np
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.patching_tables import SITES
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import INK, PAGE_IN, NotRun, figure_style, fraction, new_figure, plain
 
 if TYPE_CHECKING:
@@ -52,21 +52,15 @@ def patching(results: Results) -> Figure:
                 ax.set_axis_off()
                 continue
             images.append(_effects(ax, part))
-            n = int(part["n"].max())
+            model_and_dataset = f"{plain(model)[:20]}: {TITLE_OF[dataset].lower()},"
+            pairs = f"into the {patched_side}, {count_noun(int(part['n'].max()), 'pair')}"
             if has_one_site:
-                ax.set_title(
-                    f"{plain(model)[:20]}: {TITLES[dataset].lower()}, into the {patched_side}, {count_noun(n, 'pair')}",
-                    size=7,
-                )
+                ax.set_title(f"{model_and_dataset} {pairs}", size=7)
                 continue
             if place < across:
                 ax.set_title(SITES[site], size=7.5)
             if place % across == 0:
-                ax.set_ylabel(
-                    f"{plain(model)[:20]}: {TITLES[dataset].lower()},\n"
-                    f"into the {patched_side}, {count_noun(n, 'pair')}",
-                    size=7,
-                )
+                ax.set_ylabel(f"{model_and_dataset}\n{pairs}", size=7)
         for ax in axes.flat[len(panels) :]:
             ax.set_axis_off()
         figure.colorbar(images[-1], ax=list(axes.flat), label="indirect effect", shrink=0.8, aspect=25, pad=0.01)

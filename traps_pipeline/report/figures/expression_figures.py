@@ -22,8 +22,8 @@ from traps_pipeline.report.tables.claims import (
     claim_frame,
     lead_rows,
 )
-from traps_pipeline.report.tables.inside_columns import why
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.tables.inside_columns import why_not
+from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import (
     COLOURS,
     GRID,
@@ -55,7 +55,7 @@ def claims(results: Results) -> Figure:
     """
     rows = claim_frame(results)
     if not len(rows):
-        raise NotRun(why(results, "the paper has no such controls"))
+        raise NotRun(why_not(results, "the paper has no such controls"))
     models, by_name = list(dict.fromkeys(rows["model"])), {claim.name: claim for claim in CLAIMS}
     with figure_style():
         figure = new_figure(PAGE_IN, 0.7 + 0.2 * len(CLAIMS) * len(models) + 0.3 * len(models))
@@ -102,7 +102,7 @@ def leads(results: Results) -> Figure:
     """
     rows = lead_rows(results)
     if not len(rows):
-        raise NotRun(why(results, "the paper has no such rivals"))
+        raise NotRun(why_not(results, "the paper has no such rivals"))
     models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows.assign(dataset=rows["target"]))
     rivals = [name for name in OTHER_GATES if name in rows and name not in ("first frame", "time stamps")]
     with figure_style():
@@ -114,7 +114,7 @@ def leads(results: Results) -> Figure:
                 for row in part.to_dict("records"):
                     _lead_marks(ax, y, row, rivals)
             ax.axvline(0.5, color=GRID, linewidth=0.8, zorder=0)
-            ax.set_yticks(range(len(datasets)), [TITLES[name].lower() for name in datasets])
+            ax.set_yticks(range(len(datasets)), [TITLE_OF[name].lower() for name in datasets])
             ax.set(xlim=(0, 1.03), ylim=(len(datasets) - 0.4, -0.6), title=plain(str(model))[:40])
         panels[-1].set_xlabel("AUROC of voids against controls (0.5: chance)")
         handles = [
@@ -152,7 +152,7 @@ def lens(results: Results) -> Figure:
     """
     rows = results.lens
     if not len(rows):
-        raise NotRun(why(results, "the paper has no such curves"))
+        raise NotRun(why_not(results, "the paper has no such curves"))
     from matplotlib.ticker import MaxNLocator
 
     models, datasets = list(dict.fromkeys(rows["model"])), datasets_of(rows)

@@ -11,9 +11,9 @@ import numpy as np
 from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
-from traps_pipeline.report.figures.looks import arrow, family_of, frame_plane, legend_key, looks
+from traps_pipeline.report.figures.looks import arrow, frame_plane, legend_key, looks, model_family
 from traps_pipeline.report.result_frames import Results, datasets_of
-from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLES
+from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLE_OF
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
 from traps_pipeline.scoring import analyses
 
@@ -30,12 +30,12 @@ def landscape(results: Results) -> Figure:
     """
     overall, cells = results.overall, results.cells
     if len(overall):
-        return landscape_figure(overall, TITLES["overall"])
+        return landscape_figure(overall, TITLE_OF["overall"])
     if not len(cells):
         raise NotRun(results.why("cells"))
     first = datasets_of(cells)[0]
     points = cells.loc[cells["dataset"] == first]
-    return landscape_figure(points.assign(j=points["abs_rec"] - points["false_abs"]), TITLES[first])
+    return landscape_figure(points.assign(j=points["abs_rec"] - points["false_abs"]), TITLE_OF[first])
 
 
 def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
@@ -147,7 +147,7 @@ def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
 
 
 def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
-    families = guided["model"].map(family_of)
+    families = guided["model"].map(model_family)
     for _, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
         best = rows.loc[rows["pecs"].idxmax()]
         if best["pecs"] > 0:

@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 OWN, REFERENCE = "own", REFERENCE_ROWS.lower()
 
 
-def family_of(model: str) -> str:
+def model_family(model: str) -> str:
     """Return a model's family in the registry, or `own` if it is not there; REFERENCE of all reference rows."""
     entry = load_models().get(model)
     return OWN if not entry else REFERENCE if is_reference(model) else entry.groups.family
 
 
-def families() -> list[str]:
+def family_order() -> list[str]:
     """Return all families: the paper's, then the registry's others, REFERENCE and OWN."""
-    order = dict.fromkeys(map(family_of, load_models()))
+    order = dict.fromkeys(map(model_family, load_models()))
     return [*(name for name in order if name != REFERENCE), REFERENCE, OWN]
 
 
 def family_colour(family: str) -> str:
     """Return the colour of a family in every figure; reference strategies are grey."""
-    other_families = [name for name in families() if name != REFERENCE]
+    other_families = [name for name in family_order() if name != REFERENCE]
     return COLOURS[-1] if family == REFERENCE else COLOURS[other_families.index(family) % (len(COLOURS) - 1)]
 
 
@@ -41,7 +41,7 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     models = set(models)
     model_names = dict.fromkeys([*load_models(), *sorted(models)])
     model_names = [name for name in model_names if name in models or not is_reference(name)]
-    colours = {model: family_colour(family_of(model)) for model in model_names}
+    colours = {model: family_colour(model_family(model)) for model in model_names}
     models_by_colour = {colour: [m for m in model_names if colours[m] == colour] for colour in COLOURS}
     return {m: (colours[m], MARKERS[models_by_colour[colours[m]].index(m) % len(MARKERS)]) for m in models}
 

@@ -13,9 +13,9 @@ from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, T
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
 from traps_pipeline.report.figures.looks import legend_key, range_text
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.inside_columns import why
+from traps_pipeline.report.tables.inside_columns import why_not
 from traps_pipeline.report.tables.probe_tables import best_layers
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import COLOURS, GRID, PAGE_IN, SOFT, NotRun, figure_style, new_figure, plain
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ SETS = {"transfer": "transfer", "within_domain": "within"}
 
 def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) -> None:
     """Draw the legend below the panels: sources by colour and line, targets by marker."""
-    sources = [legend_key(f"from {TITLES[d].lower()}", colours[d], line=LINE[d]) for d in DATASETS]
-    targets = [legend_key(f"to {TITLES[d].lower()}", SOFT, MARKER[d], size=3.5) for d in DATASETS]
+    sources = [legend_key(f"from {TITLE_OF[d].lower()}", colours[d], line=LINE[d]) for d in DATASETS]
+    targets = [legend_key(f"to {TITLE_OF[d].lower()}", SOFT, MARKER[d], size=3.5) for d in DATASETS]
     handles = [*sources, *targets, *more]
     style: dict[str, Any] = {"columnspacing": 1.0, "handlelength": 2.0, "handletextpad": 0.4}
     figure.legend(handles=handles, loc="outside lower center", ncols=4, **style)
@@ -58,7 +58,7 @@ def probe_curves(results: Results) -> Figure:
     rows = results.probes
     curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
     if not len(curves):
-        raise NotRun(why(results))
+        raise NotRun(why_not(results))
     models = list(dict.fromkeys(curves["model"]))
     with figure_style():
         figure = new_figure(PAGE_IN, 0.65 + 1.75 * len(models))
@@ -112,7 +112,7 @@ def confabulated_strip(results: Results) -> Figure:
     """
     rows = best_layers(results.probes)
     if not len(rows) or rows.loc[:, "cf_value"].isna().all():
-        reason = "no dataset has confabulated voids" if len(rows) else why(results)
+        reason = "no dataset has confabulated voids" if len(rows) else why_not(results)
         raise NotRun(reason)
     models = list(dict.fromkeys(rows["model"]))
     with figure_style():
@@ -161,7 +161,7 @@ def dose_response(results: Results) -> Figure:
     rows = rows.loc[rows["kind"] == "void"]
     panels = _panels(rows)
     if not panels:
-        raise NotRun(why(results))
+        raise NotRun(why_not(results))
     across = 2 if len(panels) > 1 else 1
     lines = -(-len(panels) // across)
     with figure_style():
@@ -241,7 +241,7 @@ def cosine_heatmaps(results: Results) -> Figure:
     rows = results.cosines
     rows = rows.loc[rows["prompt"] == rows["other_prompt"]]
     if not len(rows):
-        raise NotRun(why(results))
+        raise NotRun(why_not(results))
     panels = [(str(key[0]), str(key[1]), part) for key, part in rows.groupby(["model", "prompt"], sort=False)]  # pyright: ignore[reportIndexIssue]
     has_several_prompts = len({prompt for _, prompt, _ in panels}) > 1
     columns = min(3, len(panels))
@@ -259,7 +259,7 @@ def cosine_heatmaps(results: Results) -> Figure:
 
 
 def _heatmap(ax: Axes, part: pd.DataFrame) -> Any:
-    names = [TITLES[name].replace(", ill", ",\nill") for name in DATASETS]
+    names = [TITLE_OF[name].replace(", ill", ",\nill") for name in DATASETS]
     row_of = {(row["dataset"], row["other_dataset"]): row for row in part.to_dict("records")}
     values, texts = np.full((4, 4), np.nan), dict[tuple[int, ...], str]()
     for (row, row_dataset), (column, column_dataset) in product(enumerate(DATASETS), repeat=2):

@@ -17,7 +17,7 @@ from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.regimes import GUIDED, RANDOM_WEIGHTS, STANDARD
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.control_reports import prompts
-from traps_pipeline.report.tables.inside_columns import short_names, why
+from traps_pipeline.report.tables.inside_columns import short_names, why_not
 from traps_pipeline.report.tables.interaction_table import interaction_table
 from traps_pipeline.report.tables.table_columns import MODEL as MODEL_COLUMN
 from traps_pipeline.report.writing import Column, PrintedTable, fraction
@@ -340,7 +340,7 @@ def _claims(results: Results) -> PrintedTable:
         "probes are fitted on other datasets; rivals: words, pixels, length, time stamps, the output margin, and a "
         "probe on the logits of the first token",
     ]
-    reason = why(results, "the paper has no such controls")
+    reason = why_not(results, "the paper has no such controls")
     return PrintedTable("claims", "What is claimed, and in which controls it holds too", rows, columns, notes, reason)
 
 
@@ -378,7 +378,7 @@ def _leads(results: Results) -> PrintedTable:
         notes.append(
             f"{model} under {regime}, PECS {fraction(part['plain_pecs'].iloc[0])} without a gate; gated on {figures}"
         )
-    reason = why(results, "the paper has no such rivals")
+    reason = why_not(results, "the paper has no such rivals")
     return PrintedTable(
         "leads", "States and their rivals, in the model and in its controls", rows, columns, notes, reason
     )

@@ -12,21 +12,21 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import GUIDED, PROMPTING, REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
+    COUNT_COLUMNS,
     COUNTED,
-    COUNTS,
     DATASET,
     EPOCH,
     MODEL,
     PECS,
     REGIME,
-    SHARES,
+    SHARE_COLUMNS,
     J,
     cell_trace,
     combined_counts,
     entries,
     epochs,
     frame,
-    marks,
+    mark_notes,
     no_overall,
     rightly_empty,
     sort_rows,
@@ -62,12 +62,12 @@ def visual_textual(results: Results) -> list[PrintedTable]:
             Column(names["textual"], f"{word} textual %", "percent"),
             Column(names["gap"], f"{word} gap", "ratio", mark=names["mark"]),
         ]
-    columns += COUNTS
+    columns += COUNT_COLUMNS
     notes = [
         epochs(rates.assign(dataset=rates["model"])),
         "AbsRec under standard; gap: textual over visual, ∞ where only the visual is 0",
         "pooled: means over both taxonomies, and their ratio",
-        *marks(rates),
+        *mark_notes(rates),
         *([] if results.is_study else ["gaps of the printed, rounded rates"]),
         *results.refused.get("rates", []),
     ]
@@ -120,10 +120,10 @@ def uplift(results: Results) -> list[PrintedTable]:
         Column("ratio", "Ratio", "ratio", digits=2, mark="mark"),
         *(Column(f"{r}_false_abs", f"FalseAbs %, {r}", "percent") for r in regimes),
         *(Column(f"{r}_pecs", f"PECS, {r}", "fraction", mark=f"{r}_mark") for r in regimes),
-        *COUNTS,
+        *COUNT_COLUMNS,
     ]
     notes = [epochs(results.cells), "equal-weight means over the four datasets; ∞ where only standard is 0"]
-    notes += [*marks(table), *refusals]
+    notes += [*mark_notes(table), *refusals]
     absence = "no model has standard and guided on all four datasets"
     return [PrintedTable("guided_uplift", "Guided against standard", table, columns, notes, absence, _regime_trace)]
 
@@ -140,14 +140,14 @@ def naive(results: Results) -> list[PrintedTable]:
     gap_cells = analyses.naive_gap(cells, NAIVE_THRESHOLD)
     rows = with_titles(rows.sort_values("gap", ascending=False, ignore_index=True, kind="stable"))
     columns = [
-        MODEL, DATASET, SHARES[0], SHARES[1], SHARES[2], PECS,
-        Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNTS, EPOCH,
+        MODEL, DATASET, SHARE_COLUMNS[0], SHARE_COLUMNS[1], SHARE_COLUMNS[2], PECS,
+        Column("naive", "Naive", "fraction"), Column("gap", "Naive − PECS", "fraction"), *COUNT_COLUMNS, EPOCH,
     ]  # fmt: skip
     notes = [
         f"guided; Naive = Acc × AbsRec of the means over runs; {len(gap_cells)} of {len(rows)} cells differ by more "
         f"than {NAIVE_THRESHOLD}",
         epochs(cells),
-        *marks(rows),
+        *mark_notes(rows),
     ]
     return [
         PrintedTable(
@@ -159,11 +159,11 @@ def naive(results: Results) -> list[PrintedTable]:
 def zero_boundary(results: Results) -> list[PrintedTable]:
     """Return cells with PECS 0: voids not told from controls, or Acc 0."""
     rows = sort_rows(with_titles(with_marks(analyses.zero_boundary(results.cells))), ["regime", "dataset", "model"])
-    columns = [MODEL, DATASET, REGIME, *SHARES, PECS, *COUNTS, EPOCH]
+    columns = [MODEL, DATASET, REGIME, *SHARE_COLUMNS, PECS, *COUNT_COLUMNS, EPOCH]
     n_cells = results.cells.groupby("regime", sort=False).size()
     zero = rows.groupby("regime").size().reindex(n_cells.index, fill_value=0)
     notes = [", ".join(f"{regime}: {zero[regime]} of {n} cells" for regime, n in n_cells.items()), epochs(rows)]
-    notes += marks(rows)
+    notes += mark_notes(rows)
     reason = "no cell has PECS 0" if len(results.cells) else results.why("cells")
     table = PrintedTable("zero_boundary", "Cells with PECS 0", rows, columns, notes, reason, cell_trace)
     return [rightly_empty(table, bool(len(results.cells)))]
@@ -172,8 +172,8 @@ def zero_boundary(results: Results) -> list[PrintedTable]:
 def frontier(results: Results) -> list[PrintedTable]:
     """Return the Pareto frontier in (Acc, J), averaged over datasets, by regime."""
     rows = sort_rows(with_marks(analyses.frontier(results.overall)), ["regime"])
-    columns = [REGIME, MODEL, SHARES[0], J, PECS, *COUNTS]
-    notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *marks(rows)]
+    columns = [REGIME, MODEL, SHARE_COLUMNS[0], J, PECS, *COUNT_COLUMNS]
+    notes = ["no other model is as good in both Acc and J and better in one", epochs(results.cells), *mark_notes(rows)]
     return [PrintedTable("frontier", "Pareto frontier", rows, columns, notes, no_overall(results, False), cell_trace)]
 
 
@@ -199,11 +199,11 @@ def reasoning(results: Results) -> list[PrintedTable]:
     table = sort_rows(with_titles(table), ["thinking", "regime", "dataset"])
     columns = [
         Column("thinking", "Thinking"), Column("other", "Other"), REGIME, DATASET,
-        *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARES),
-        Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNTS,
+        *(Column(c.field, f"Δ {c.heading}", c.unit) for c in SHARE_COLUMNS),
+        Column("pecs", "Δ PECS", "fraction", mark="mark"), *COUNT_COLUMNS,
     ]  # fmt: skip
     notes = [epochs(results.cells), "thinking minus other; Δ of shares in points; missing: items of both models"]
-    notes += [*marks(table), *refusals]
+    notes += [*mark_notes(table), *refusals]
     trace: Trace = lambda row, field: SourceItems(  # noqa: E731
         row["dataset"] if row["dataset"] in DATASETS else "", row["thinking"], row["regime"], SIDE_OF.get(field, "")
     )
@@ -227,12 +227,12 @@ def contrasts(results: Results) -> list[PrintedTable]:
         Column("right_regime", "Regime"), Column("difference", "Δ PECS", "fraction", mark="mark"),
         Column("ci_low", "95 % CI from", "fraction"), Column("ci_high", "to", "fraction"),
         Column("p", "p", "p"), Column("p_holm", "p, Holm", "p"), Column("separable", "Separable"),
-        *COUNTS, Column("refused", "Refused"),
+        *COUNT_COLUMNS, Column("refused", "Refused"),
     ]  # fmt: skip
     notes = ["left minus right; the other metrics and datasets are in the workspace's table `contrasts`"]
     if TOO_FEW in set(rows["separable"]):
         notes.append(f"{TOO_FEW}: no answers to so few scenarios could differ significantly")
-    notes += ["missing: items of both sides", *marks(rows)] if len(rows) else []
+    notes += ["missing: items of both sides", *mark_notes(rows)] if len(rows) else []
     trace: Trace = lambda row, field: SourceItems("", row["left_model"], row["left_regime"])  # noqa: E731
     reason = "fewer than two entries have all four datasets" if results.is_study else results.why("contrasts")
     return [PrintedTable("contrasts", "Paired contrasts", rows, columns, notes, reason, trace)]
@@ -278,8 +278,8 @@ def degenerate(results: Results) -> list[PrintedTable]:
     """Return expected and measured scores of strategies that do not discriminate."""
     rows = analyses.degenerate_strategies()
     columns = [
-        Column("strategy", "Strategy"), *SHARES, Column("j", "J", "fraction"), Column("naive", "Naive", "fraction"),
-        Column("pecs", "PECS", "fraction"),
+        Column("strategy", "Strategy"), *SHARE_COLUMNS, Column("j", "J", "fraction"),
+        Column("naive", "Naive", "fraction"), Column("pecs", "PECS", "fraction"),
     ]  # fmt: skip
     notes = ["in expectation; Acc is open where the strategy does not determine it, and PECS is still 0"]
     if results.is_study:
@@ -289,10 +289,11 @@ def degenerate(results: Results) -> list[PrintedTable]:
         rows = with_marks(rows.merge(measured_rows, on="strategy", how="left"))
         columns += [
             Column("measured_j", "J, measured", "fraction", spread="measured_j_std"),
-            Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std", mark="mark"), *COUNTS,
-        ]  # fmt: skip
+            Column("measured_pecs", "PECS, measured", "fraction", spread="measured_pecs_std", mark="mark"),
+            *COUNT_COLUMNS,
+        ]
         notes.append("measured: overall, standard; PECS clips J at 0, so chance alone lifts a random strategy above 0")
-        notes += marks(rows)
+        notes += mark_notes(rows)
     trace: Trace = lambda row, field: (  # noqa: E731
         SourceItems("", row["strategy"], "standard") if field.startswith("measured") or field in COUNTED else None
     )

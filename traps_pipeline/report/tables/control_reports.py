@@ -21,7 +21,7 @@ from traps_pipeline.report.tables.inside_columns import (
     joined_notes,
     path_names,
     short_names,
-    why,
+    why_not,
 )
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
@@ -63,7 +63,7 @@ def _nulls(results: Results) -> PrintedTable:
         *_extent_beyond_nulls(rows),
         *few_note(table_rows),
     ]
-    reason = why(results, "the paper has no such nulls")
+    reason = why_not(results, "the paper has no such nulls")
     return PrintedTable("steering_nulls", "Void directions among their nulls", table_rows, columns, notes, reason)
 
 
@@ -109,7 +109,7 @@ def _pecs(results: Results) -> PrintedTable:
         "degenerate: cut off, a phrase four times in a row, or another script or language than the unsteered answer",
         *few_note(table_rows),
     ]
-    reason = why(results, "the paper prints no correctness of steered answers")
+    reason = why_not(results, "the paper prints no correctness of steered answers")
     return PrintedTable("steering_pecs", "PECS of the steered model", table_rows, columns, notes, reason)
 
 
@@ -166,7 +166,7 @@ def _gate_sources(results: Results) -> PrintedTable:
         *joined_notes(rows),
         *few_note(rows),
     ]
-    reason = why(results, "the paper gates nothing")
+    reason = why_not(results, "the paper gates nothing")
     return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, reason)
 
 
@@ -227,6 +227,6 @@ def _prompts(results: Results) -> PrintedTable:
         "states, mean ± deviation over draws, the floor of the split",
         *few_note(rows, "said_mark", "probe_mark"),
     ]
-    reason = why(results, "the paper prints no such numbers")
+    reason = why_not(results, "the paper prints no such numbers")
     title = "What the prompt changes, in answers and in states"
     return PrintedTable("prompt_gate", title, rows, columns, notes, reason, deviation=DRAWS)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 BY_PEOPLE = "nobody has labelled yet (run traps people annotate)"
-_FIGURES = [Column(name, metric.heading, metric.unit, interval=True) for name, metric in METRIC_WORDS.items()]
+_METRICS = [Column(name, metric.heading, metric.unit, interval=True) for name, metric in METRIC_WORDS.items()]
 _RATES = [Column(name, f"{name.capitalize()} %", "percent", interval=True) for name in ("sensitivity", "specificity")]
 
 
@@ -29,7 +29,7 @@ def people(results: Results) -> list[PrintedTable]:
     """Return people's scores by dataset, and their agreement on clips and answers."""
     rows = sort_rows(with_titles(results.human_row), ["dataset"])
     columns = [
-        DATASET, *_FIGURES, Column("agreement", "Agree %", "percent"),
+        DATASET, *_METRICS, Column("agreement", "Agree %", "percent"),
         Column("alpha", "Krippendorff’s α", "fraction", 2),
         Column("seconds", "Seconds", "ratio"), Column("n_people", "People", "count"),
         Column("n_clips", "Clips", "count"), Column("n_labels", "Labels", "count"),
@@ -98,7 +98,7 @@ def _score_of_people(rows: pd.DataFrame) -> str:
     row = row_of.get("overall", {})
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
-    figures = ", ".join(f"{each.heading.removesuffix(' %')} {each.text(row)}" for each in _FIGURES)
+    figures = ", ".join(f"{each.heading.removesuffix(' %')} {each.text(row)}" for each in _METRICS)
     readers, clips_seen = count_noun(row["n_people"], "person", "people"), count_noun(row["n_clips"], "clip")
     return f"{figures} ({readers}, {clips_seen}, {row['seconds']:.0f} s a clip)"
 

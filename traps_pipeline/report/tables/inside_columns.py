@@ -37,7 +37,7 @@ BASELINE_NOTES = (
 )
 
 
-def why(results: Results, of_paper: str = "") -> str:
+def why_not(results: Results, of_paper: str = "") -> str:
     """Return why a mechanistic frame has no rows; of_paper: why the paper's has none."""
     if of_paper and not results.is_study:
         return of_paper

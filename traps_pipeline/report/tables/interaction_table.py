@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from traps_pipeline.mechanism.control_rows import STATES
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.inside_columns import why
+from traps_pipeline.report.tables.inside_columns import why_not
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
@@ -34,6 +34,6 @@ def interaction_table(results: Results) -> PrintedTable:
     rows = rows.merge(answers, on=["model", "prompt"], how="left")
     is_one = rows["joins"].isna() & (rows["features"] == STATES)
     rows[["answers_own", "answers_other"]] = rows[["answers_own", "answers_other"]].where(is_one)
-    reason = why(results, "the paper has no two events")
+    reason = why_not(results, "the paper has no two events")
     notes = _NOTES if len(rows) else ()
     return PrintedTable("interaction", "Is the asked event the hidden one?", rows, _COLUMNS, notes, reason)

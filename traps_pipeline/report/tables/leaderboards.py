@@ -8,26 +8,26 @@ from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.table_columns import (
-    COUNTS,
+    COUNT_COLUMNS,
     DATASET,
     EPOCH,
     MODEL,
     PECS,
     REGIME,
-    SHARES,
+    SHARE_COLUMNS,
     J,
     best_first,
     cell_trace,
     epochs,
     interval,
-    marks,
+    mark_notes,
     no_overall,
     ranks,
     sort_rows,
     with_marks,
     with_titles,
 )
-from traps_pipeline.report.terms import TITLES
+from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, Trace
 from traps_pipeline.scoring import analyses
 from traps_pipeline.scoring.published import published_overall
@@ -49,8 +49,8 @@ def replication_overall(results: Results) -> list[PrintedTable]:
 def _overall(results: Results, name: str, title: str, replication: bool) -> PrintedTable:
     rows = with_marks(results.overall)
     rows = rows.loc[rows["model"].isin(analyses.models_of(group="replication")) == replication]
-    columns = [MODEL, REGIME, PECS, *SHARES, J]
-    notes = [epochs(results.cells), "equal-weight mean over the four datasets", *marks(rows)]
+    columns = [MODEL, REGIME, PECS, *SHARE_COLUMNS, J]
+    notes = [epochs(results.cells), "equal-weight mean over the four datasets", *mark_notes(rows)]
     if results.is_study:
         records = rows.to_dict("records")
         rows = rows.assign(ci=[interval(row) for row in records], ranks=[ranks(row) for row in records])
@@ -64,7 +64,7 @@ def _overall(results: Results, name: str, title: str, replication: bool) -> Prin
             columns.append(Column("published_pecs", "published PECS", "fraction"))
             notes.append("published PECS: as printed in the paper, from its own benchmark and epochs")
     return PrintedTable(
-        name, title, best_first(rows), [*columns, *COUNTS], notes, no_overall(results, replication), cell_trace
+        name, title, best_first(rows), [*columns, *COUNT_COLUMNS], notes, no_overall(results, replication), cell_trace
     )
 
 
@@ -81,14 +81,14 @@ def per_dataset(results: Results) -> list[PrintedTable]:
         names = {"pecs": dataset, "pecs_std": f"{dataset}_std", "mark": f"{dataset}_mark", "n_pairs": f"{dataset}_n"}
         part = cells.loc[cells["dataset"] == dataset, [*index, *names]].rename(columns=names)
         rows = rows.merge(part, on=index, how="left")
-        heading = _n(TITLES[dataset], part[f"{dataset}_n"])
+        heading = _n(TITLE_OF[dataset], part[f"{dataset}_n"])
         columns.append(Column(dataset, heading, "fraction", spread=f"{dataset}_std", mark=f"{dataset}_mark"))
     names = {"pecs": "mean", "pecs_std": "mean_std", "mark": "mean_mark"}
     overall = with_marks(results.overall).reindex(columns=pd.Index([*index, *names])).rename(columns=names)
     rows = rows.merge(overall, on=index, how="left")
     columns.append(Column("mean", "Mean", "fraction", spread="mean_std", mark="mean_mark"))
     rows = rows.sort_values("mean", ascending=False, na_position="last", ignore_index=True, kind="stable")
-    notes = [epochs(cells), "mean: overall, over the runs that have all four datasets", *marks(cells)]
+    notes = [epochs(cells), "mean: overall, over the runs that have all four datasets", *mark_notes(cells)]
     trace: Trace = lambda row, field: SourceItems(field if field in DATASETS else "", row["model"], row["regime"])  # noqa: E731
     return [PrintedTable("per_dataset", "PECS by dataset", rows, columns, notes, results.why("cells"), trace)]
 
@@ -98,8 +98,8 @@ def replication_per_dataset(results: Results) -> list[PrintedTable]:
     cells = with_marks(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
     rows = sort_rows(with_titles(rows), ["model", "dataset", "regime"])
-    columns = [MODEL, DATASET, REGIME, PECS, *SHARES, *COUNTS, EPOCH]
-    notes = [epochs(rows), *marks(rows)]
+    columns = [MODEL, DATASET, REGIME, PECS, *SHARE_COLUMNS, *COUNT_COLUMNS, EPOCH]
+    notes = [epochs(rows), *mark_notes(rows)]
     reason = "no model of the replication families"
     title = "Replication families, by dataset"
     return [PrintedTable("replication_per_dataset", title, rows, columns, notes, reason, cell_trace)]
@@ -118,11 +118,11 @@ def expanded(results: Results) -> list[PrintedTable]:
     for dataset in DATASETS:
         for regime in PAPER_REGIMES:
             rows = cells.loc[(cells["dataset"] == dataset) & (cells["regime"] == regime)]
-            notes = [epochs(rows), *marks(rows)]
+            notes = [epochs(rows), *mark_notes(rows)]
             tables.append(
                 PrintedTable(
-                    f"expanded_{dataset}_{regime}", f"{TITLES[dataset]}, {regime}", best_first(rows),
-                    [MODEL, *SHARES, PECS, *COUNTS, EPOCH], notes, "no model was asked here", cell_trace,
+                    f"expanded_{dataset}_{regime}", f"{TITLE_OF[dataset]}, {regime}", best_first(rows),
+                    [MODEL, *SHARE_COLUMNS, PECS, *COUNT_COLUMNS, EPOCH], notes, "no model was asked here", cell_trace,
                 )
             )  # fmt: skip
     return tables

@@ -26,7 +26,7 @@ from traps_pipeline.report.tables.inside_columns import (
     few_note,
     interval,
     short_names,
-    why,
+    why_not,
 )
 from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
@@ -67,7 +67,7 @@ class RowRule(NamedTuple):
 
 _LAYER_AND_VALUE = ("layer", "value", "low", "high")
 # The figures of a pair of datasets, by the prefix of their columns in `best_layers`.
-PAIR_FIGURES = {
+PAIR_METRICS = {
     "best": RowRule("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
     "chosen": RowRule("transfer", "chosen", _LAYER_AND_VALUE),
     "held_out": RowRule("held_out", "all_sample_best"),
@@ -80,7 +80,7 @@ BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_hel
 
 
 def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return PAIR_FIGURES by model and pair: best, chosen layers, and Cf->Cf at both."""
+    """Return PAIR_METRICS by model and pair: best, chosen layers, and Cf->Cf at both."""
     import pandas as pd
 
     def by_pair(analysis: str, chosen: Any) -> dict[tuple[str, ...], dict[str, Any]]:
@@ -89,14 +89,14 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
     transfers = by_pair("transfer", rows["model"].notna())
     is_known = rows["value"].notna()
-    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_FIGURES.items()}
+    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_METRICS.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
         | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
         | {
             f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan)
-            for name, rule in PAIR_FIGURES.items()
+            for name, rule in PAIR_METRICS.items()
             for c in rule.columns
         }
         | {"note": next((notes_of[key]["note"] for notes_of in notes if key in notes_of), "")}
@@ -143,7 +143,9 @@ def _transfer(results: Results, rows: pd.DataFrame) -> PrintedTable:
         *few_note(rows),
     ]
     title = "Probe transfer: AUROC by ordered pair"
-    return PrintedTable("probe_transfer", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
+    return PrintedTable(
+        "probe_transfer", title, rows, columns, notes, why_not(results), dash=WHY_UNSHARED, deviation=DRAWS
+    )
 
 
 def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
@@ -164,7 +166,7 @@ def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
         *baseline_notes(results),
         *few_note(rows, "cf_mark"),
     ]
-    reason = why(results, "the paper has these numbers in its table of probe transfer")
+    reason = why_not(results, "the paper has these numbers in its table of probe transfer")
     if results.is_study and len(results.probes):
         reason = "; ".join(gap_notes) or reason
     title = "Probes on confabulated voids (Cf→Cf)"
@@ -175,7 +177,7 @@ def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
         baseline_names = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures = [*(f"{name}_value" for name in PAIR_FIGURES), *baseline_names, "held_noise", "cf_held_noise"]
+        figures = [*(f"{name}_value" for name in PAIR_METRICS), *baseline_names, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = (
             dict[str, Any].fromkeys(figures, "mean")
@@ -201,7 +203,9 @@ def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
         ]  # fmt: skip
         notes.append("best raw inputs are the best of each path, and their AUROC is the mean over these")
     title = "Probe transfer: means over paths"
-    return PrintedTable("probe_means", title, rows, columns, notes, why(results), dash=WHY_UNSHARED, deviation=DRAWS)
+    return PrintedTable(
+        "probe_means", title, rows, columns, notes, why_not(results), dash=WHY_UNSHARED, deviation=DRAWS
+    )
 
 
 def _names_by_frequency(names: pd.Series) -> str:
@@ -263,7 +267,7 @@ def _within_table(results: Results) -> PrintedTable:
         "Probes within a dataset",
         "± standard deviation over shuffles of labels, or over draws of noise",
     )
-    return PrintedTable("probe_within", title, table, columns, notes, why(results), deviation=spread_note)
+    return PrintedTable("probe_within", title, table, columns, notes, why_not(results), deviation=spread_note)
 
 
 def _catch(results: Results) -> PrintedTable:
@@ -291,7 +295,7 @@ def _catch(results: Results) -> PrintedTable:
             "of a baseline are its own",
         ]
     notes += few_note(table)
-    return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why(results))
+    return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why_not(results))
 
 
 def _caught_columns() -> Iterator[Column]:

@@ -25,7 +25,7 @@ from traps_pipeline.report.tables.inside_columns import (
     interval,
     path_names,
     short_names,
-    why,
+    why_not,
 )
 from traps_pipeline.report.tables.table_columns import MODEL, epochs, rightly_empty
 from traps_pipeline.report.writing import Column, PrintedTable
@@ -66,7 +66,7 @@ def cosines(results: Results) -> list[PrintedTable]:
         "split half: cosine between the directions of random halves of the pairs; where it is low, a small cosine says "
         "nothing",
     ]
-    return [PrintedTable("cosines", "Cosines of void directions", rows, columns, notes, why(results))]
+    return [PrintedTable("cosines", "Cosines of void directions", rows, columns, notes, why_not(results))]
 
 
 def _direction_names(rows: pd.DataFrame, prefix: str) -> list[str]:
@@ -118,7 +118,7 @@ def _shares(results: Results) -> PrintedTable:
         "mean over all paths and regimes; answers: distinct answers, each of which may belong to several paths",
         "from, to: 95 % interval from resampled scenarios, not answers; its width is 0 where all scenarios agree",
     ]
-    reason = why(results, "the paper prints no answers to resample")
+    reason = why_not(results, "the paper prints no answers to resample")
     return PrintedTable(
         "steering_shares", "Steering in all, with intervals by scenario", by_side, columns, notes, reason
     )
@@ -134,7 +134,7 @@ def _regimes(results: Results, name: str, title: str) -> PrintedTable:
         Column("void_top", "Void, α, %", "percent"), Column("n_paths", "Paths", "count"),
     ]  # fmt: skip
     notes = ["mean over the paths of a set; +α on controls, −α on voids", *_cell_notes(results)]
-    reason = why(results)
+    reason = why_not(results)
     if name.endswith("families") and len(results.effects):
         reason = "no directions of the guided prompt were steered under guided inference"
     return PrintedTable(name, title, rows, columns, notes, reason)
@@ -155,7 +155,7 @@ def _domains(results: Results) -> PrintedTable:
             "judged by the panel; the paper judged its two same-domain rates by keywords, which it does not print: "
             "no keyword judge here would be its own"
         )
-    return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, why(results))
+    return PrintedTable("steering_domains", "Same against cross domain", rows, columns, notes, why_not(results))
 
 
 def _top(results: Results) -> PrintedTable:
@@ -163,7 +163,8 @@ def _top(results: Results) -> PrintedTable:
     rows = rows.loc[(rows["kind"] == "void") & (rows["alpha"] == rows.groupby("model")["alpha"].transform("max"))]
     rows = _with_names(rows)
     columns = [MODEL, DIRECTIONS, INFERENCE, PATH, TYPE, ALPHA, *_in_gaps(results), *_SIDES, *_counts(results)]
-    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, _cell_notes(results), why(results))
+    notes = _cell_notes(results)
+    return PrintedTable("steering_top", "Steering at the largest α", rows, columns, notes, why_not(results))
 
 
 def _dose(results: Results) -> PrintedTable:
@@ -174,7 +175,7 @@ def _dose(results: Results) -> PrintedTable:
     columns += _counts(results)
     notes = [epochs(results.effects), *_cell_notes(results)]
     notes += ["from, to: 95 % Wilson interval"] * results.is_study
-    return PrintedTable("steering_dose", "Dose and response", rows, columns, notes, why(results))
+    return PrintedTable("steering_dose", "Dose and response", rows, columns, notes, why_not(results))
 
 
 def _layers(results: Results) -> PrintedTable:
@@ -184,7 +185,7 @@ def _layers(results: Results) -> PrintedTable:
         Column("control", "Controls abstained on %", "percent"), Column("n_splits", "Splits", "count"),
     ]  # fmt: skip
     notes = ["each dataset’s direction on its own controls, mean over the four splits", *_cell_notes(results)]
-    reason = "only one layer was steered" if len(results.effects) else why(results)
+    reason = "only one layer was steered" if len(results.effects) else why_not(results)
     table = PrintedTable("steering_layers", "Steering by layer", rows, columns, notes, reason)
     return rightly_empty(table, results.is_study and bool(len(results.effects)))
 

@@ -11,10 +11,10 @@ from traps_pipeline.report.tables.table_columns import (
     DATASET,
     MISSING,
     PECS,
-    SHARES,
+    SHARE_COLUMNS,
     N,
     epochs,
-    marks,
+    mark_notes,
     with_marks,
     with_titles,
 )
@@ -75,7 +75,7 @@ def _sub_rows(results: Results, taxonomy: str) -> pd.DataFrame:
 def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> PrintedTable:
     columns = [
         Column("sub_scenario", "Sub-scenario"), Column("answer_type", "Answer"), N,
-        Column("n_models", "Models", "count"), *SHARES, PECS,
+        Column("n_models", "Models", "count"), *SHARE_COLUMNS, PECS,
         Column("guided_abs_rec", "AbsRec %, guided", "percent"), Column("guided_pecs", "PECS, guided", "fraction"),
         Column("abs_rec_uplift", "Δ AbsRec, guided", "percent"),
         Column("false_abs_uplift", "Δ FalseAbs, guided", "percent"),
@@ -87,7 +87,7 @@ def _sub_table(results: Results, rows: pd.DataFrame, name: str, title: str) -> P
     count_columns = {"guided": "guided_n_models", "Δ": "uplift_n_models", "ill-posed": "ill_posed_n_models"}
     if any(((rows[name] != rows["n_models"]) & (rows[name] > 0)).any() for name in count_columns.values()):
         columns += [Column(name, f"Models, {words}", "count") for words, name in count_columns.items()]
-    notes += marks(rows)
+    notes += mark_notes(rows)
     taxonomy = "occlusion" if name.startswith("occlusion") else "chaotic"
     return PrintedTable(name, title, rows, columns, notes, results.why("sub_scenarios"), _sub_trace(taxonomy))
 

@@ -14,7 +14,7 @@ from traps_pipeline.protocol.datasets import DATASETS, SHORT, TWO_EVENTS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLES
+from traps_pipeline.report.terms import INCOMPLETE_MARK, MARKS, MISSING_MARK, SIDE_OF, TITLE_OF
 from traps_pipeline.report.writing import Column, PrintedTable, SourceItems, fraction
 
 if TYPE_CHECKING:
@@ -28,14 +28,14 @@ N, MISSING, RUNS = (
     Column("n_runs", "Runs", "count"),
 )
 EPOCH = Column("epoch", "Epoch")
-_FIGURES = {
+_METRICS = {
     metric.name: Column(metric.name, metric.heading, metric.unit, spread=f"{metric.name}_std")
     for metric in METRIC_WORDS.values()
 }
-SHARES = tuple(_FIGURES[name] for name in metric_words.SHARES)
-J, PECS = _FIGURES["j"], replace(_FIGURES["pecs"], mark="mark", look="strong")
-OTHER_FIGURES = tuple(column for name, column in _FIGURES.items() if name != "pecs" and column not in SHARES)
-COUNTS = (N, RUNS, MISSING)
+SHARE_COLUMNS = tuple(_METRICS[name] for name in metric_words.SHARES)
+J, PECS = _METRICS["j"], replace(_METRICS["pecs"], mark="mark", look="strong")
+OTHER_METRICS = tuple(column for name, column in _METRICS.items() if name != "pecs" and column not in SHARE_COLUMNS)
+COUNT_COLUMNS = (N, RUNS, MISSING)
 COUNTED = ("n_pairs", "n_runs", "n_missing", "incomplete")
 
 
@@ -62,7 +62,7 @@ def with_marks(rows: pd.DataFrame) -> pd.DataFrame:
 
 def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with `title`, the printed name of the dataset."""
-    return rows.assign(title=rows.loc[:, "dataset"].map(TITLES))
+    return rows.assign(title=rows.loc[:, "dataset"].map(TITLE_OF))
 
 
 def combined_counts(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def entries(results: Results) -> pd.DataFrame:
     return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
 
 
-def marks(rows: pd.DataFrame) -> list[str]:
+def mark_notes(rows: pd.DataFrame) -> list[str]:
     """Return the meanings of the marks in these rows."""
     return meanings(rows["mark"])
 

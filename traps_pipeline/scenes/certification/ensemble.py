@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from traps_pipeline.scenes.physics.flexes import vertices
+from traps_pipeline.scenes.physics.flexes import flex_vertices
 from traps_pipeline.scenes.physics.simulate import initial_velocity, replay
 from traps_pipeline.scenes.picture.camera import Camera
 from traps_pipeline.scenes.worlds.outcome import Rejected, last_run
@@ -319,5 +319,5 @@ class _Silhouette:
         rotation = data.geom_xmat[self._solids].reshape(-1, 3, 3)
         corners = np.einsum("gij,gkj->gki", rotation, self._corners) + data.geom_xpos[self._solids, None]
         outline = self._outline + data.geom_xpos[self._balls, None]
-        soft_vertices = [vertices(self._model, data, flex) for flex in range(self._model.nflex)]
+        soft_vertices = [flex_vertices(self._model, data, flex) for flex in range(self._model.nflex)]
         return self._camera.project(np.concatenate([corners.reshape(-1, 3), outline.reshape(-1, 3), *soft_vertices]))

@@ -16,7 +16,7 @@ from traps_pipeline.base.workers import run_in_order
 from traps_pipeline.protocol.datasets import EXTENSION_CATEGORIES
 from traps_pipeline.protocol.two_events import LANES
 from traps_pipeline.scenes.certification.certify_lanes import certify_lanes, pixels_of
-from traps_pipeline.scenes.draw.resolve import plain
+from traps_pipeline.scenes.draw.resolve import json_values
 from traps_pipeline.scenes.family_registry import families, get_family
 from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty, SceneDifficulty, draw_distractors
 from traps_pipeline.scenes.parts.look import Look, draw_look
@@ -100,12 +100,12 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
     evidence = certify_lanes(world, twins)
     records = [
         LaneRecord(
-            params=plain(params_to_dict(events[k].params)),
+            params=json_values(params_to_dict(events[k].params)),
             lane=lane,
             layout=world.layouts[k],
             ground_truth=world.outcome(k).answer,
             twin=LaneTwin(
-                params=plain(params_to_dict(twins[k].events[k].params)),
+                params=json_values(params_to_dict(twins[k].events[k].params)),
                 ground_truth=twins[k].outcome(k).answer,
                 trajectory_sha256=trajectory_digest(twins[k].qpos),
             ),
@@ -118,15 +118,15 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
         family=family.name,
         seed=seed,
         physics=physics_record(world.physics),
-        camera=plain(asdict(world.camera)),
-        look=plain(asdict(look)),
+        camera=json_values(asdict(world.camera)),
+        look=json_values(asdict(look)),
         lanes=(records[0], records[1]),
         question=wording.question,
         labels=list(wording.labels),
         aliases=dict(wording.aliases),
         answer_type=family.answer_type,
         trajectory_sha256=trajectory_digest(world.qpos),
-        evidence=plain(evidence),
+        evidence=json_values(evidence),
     )
     return DrawnLanes(spec, {"qpos": world.qpos, "left": twins[0].qpos, "right": twins[1].qpos})
 

@@ -77,22 +77,22 @@ def resolve(
         sub_scenario=family.sub_scenario,
         family=family.name,
         seed=seed,
-        params=plain(params_to_dict(params)),
+        params=json_values(params_to_dict(params)),
         physics=physics_record(physics),
-        camera=plain(asdict(control.camera)),
+        camera=json_values(asdict(control.camera)),
         void_kind=void_kind,
-        void=plain({"cut_frame": frame} if occluder is None else {"panel": occluder, "hidden_from_frame": frame}),
-        control=plain(record_of(pair)),
+        void=json_values({"cut_frame": frame} if occluder is None else {"panel": occluder, "hidden_from_frame": frame}),
+        control=json_values(record_of(pair)),
         question=wording.question,
         labels=list(wording.labels),
         aliases=dict(wording.aliases),
         answer_type=family.answer_type,
         ground_truth=control.outcome.answer,
         ill_posed_question=ill_posed_question,
-        answerable_question=plain(asdict(wording.answerable_question)),
+        answerable_question=json_values(asdict(wording.answerable_question)),
         trajectory_sha256=trajectory_digest(control.qpos),
         twin=Twin(
-            params=None if occluder is None else plain(params_to_dict(twin.params)),
+            params=None if occluder is None else json_values(params_to_dict(twin.params)),
             rollout=pair.rollout,
             ground_truth=twin.outcome.answer,
             trajectory_sha256=trajectory_digest(twin.qpos),
@@ -220,10 +220,10 @@ def _is_hopeless(scouts: Sequence[Rollout], first: int) -> bool:
     return is_short or max(counts.values(), default=0) > HOPELESS_SHARE * counts.total()
 
 
-def plain(value: Any) -> Any:
+def json_values(value: Any) -> Any:
     """Return a value as JSON would read it back: lists, and Python numbers."""
     if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: json_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [json_values(item) for item in value]
     return value.item() if isinstance(value, np.generic) else value

@@ -38,7 +38,7 @@ def is_carrier(model: mujoco.MjModel) -> np.ndarray:
     return mask
 
 
-def vertices(model: mujoco.MjModel, data: mujoco.MjData, flex: int) -> np.ndarray:
+def flex_vertices(model: mujoco.MjModel, data: mujoco.MjData, flex: int) -> np.ndarray:
     """Return the vertices of a soft body (m), (V, 3), at the computed poses."""
     import mujoco
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from traps_pipeline.scenes.physics.flexes import carriers, elements, flexes, vertices
+from traps_pipeline.scenes.physics.flexes import carriers, elements, flex_vertices, flexes
 from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def replay(model: mujoco.MjModel, qpos: np.ndarray, physics: Physics) -> Motion:
         mujoco.mj_kinematics(model, data)
         positions[i], rotations[i] = data.xpos, data.xmat
         for name, places in soft_vertices.items():
-            places[i] = vertices(model, data, soft_bodies[name])
+            places[i] = flex_vertices(model, data, soft_bodies[name])
     return Motion(
         times=np.arange(len(qpos)) / physics.fps,
         positions={name: positions[:, i + 1] for i, name in enumerate(names)},
@@ -99,7 +99,7 @@ def swept_points(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
         mujoco.mj_kinematics(model, data)
         points.append(_corners(model, data, moving_geoms))
         for flex in soft_bodies:
-            at, reach = vertices(model, data, flex)[elements(model, flex)], float(model.flex_radius[flex])
+            at, reach = flex_vertices(model, data, flex)[elements(model, flex)], float(model.flex_radius[flex])
             middle, half_extent = (at.max(axis=1) + at.min(axis=1)) / 2, np.ptp(at, axis=1) / 2 + reach
             points.append(middle[:, None] + SIGNS[None] * half_extent[:, None])
     return np.concatenate(points).reshape(-1, 3)

@@ -12,7 +12,7 @@ from traps_pipeline.base.workers import run_in_order
 _OPENGL = re.compile(r"MUJOCO_|PYOPENGL_|MESA_|GALLIUM_|LIBGL_|LP_NATIVE|EGL_|__E?GL|LD_LIBRARY_PATH$|LD_PRELOAD$")
 
 
-def draw_frame() -> str:
+def render_frame() -> str:
     """Draw a red ball; return the renderer's name. Raises TrapsError with the remedy."""
     import numpy as np
 
@@ -81,7 +81,7 @@ def check_rendering() -> None:
 
 def _problem(_: None) -> str:
     try:
-        draw_frame()
+        render_frame()
         encode_clip()
     except TrapsError as error:
         return str(error)

@@ -36,7 +36,7 @@ const HIDDEN = new RegExp(
 
 const numbered = (character) => `U+${character.codePointAt(0).toString(16).toUpperCase().padStart(4, "0")}`;
 
-// A text with each hidden character as [U+202E]: for what is no element of its own. As `visible` in base/terminal.py.
+// A text with each hidden character as [U+202E]: for what is no element of its own. As `escape_invisible` in base/terminal.py.
 function visible(text) {
   return String(text).replace(HIDDEN, (character) => `[${numbered(character)}]`);
 }
