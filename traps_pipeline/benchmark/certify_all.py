@@ -99,16 +99,12 @@ def judge(case: Case) -> Verdict:
     spec = case.spec
     try:
         if isinstance(spec, TwoEventsSpec):
-            return _kept(case, certify_lane_record(spec, trajectories_of(spec, case.trajectory)))
-        qpos = load_trajectory(case.trajectory, spec.trajectory_sha256)
-        twin = load_trajectory(case.trajectory, spec.twin.trajectory_sha256, "twin")
-        verdict = certify(spec, qpos, twin)
+            verdict = certify_lane_record(spec, trajectories_of(spec, case.trajectory))
+        else:
+            qpos = load_trajectory(case.trajectory, spec.trajectory_sha256)
+            verdict = certify(spec, qpos, load_trajectory(case.trajectory, spec.twin.trajectory_sha256, "twin"))
     except (ValueError, KeyError, TypeError) as error:  # an altered record may not even build
         verdict = Verdict(spec.scenario_id, spec.family, {"record": str(error)}, {}, same_physics=False)
-    return _kept(case, verdict)
-
-
-def _kept(case: Case, verdict: Verdict) -> Verdict:
     write_text(case.verdict, json.dumps(asdict(verdict)))
     return verdict
 

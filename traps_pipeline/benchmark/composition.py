@@ -88,8 +88,11 @@ def composition_problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] |
         messages += _constant_margin(family, members)
     trajectories = [(spec.trajectory_sha256 + spec.scene_hash, spec.scenario_id) for spec in specs]
     messages += repeated(trajectories, "the same trajectory")
-    if counts is not None:
-        messages += _predictable(specs)
+    accuracy = prior_accuracy(specs) if counts is not None else 0.0
+    if accuracy > PRIOR_AT_MOST:
+        messages.append(
+            f"the commonest answer of each sub-scenario is right in {accuracy:.3f}, at most {PRIOR_AT_MOST} allowed"
+        )
     return messages
 
 
@@ -129,13 +132,6 @@ def repeated(keys: Iterable[tuple[str, str]], problem: str) -> list[str]:
     for key, scenario_id in keys:
         owners[key].append(scenario_id)
     return [f"{', '.join(ids)}: {problem}" for ids in owners.values() if len(ids) > 1]
-
-
-def _predictable(specs: Sequence[SceneSpec]) -> list[str]:
-    accuracy = prior_accuracy(specs)
-    if accuracy <= PRIOR_AT_MOST:
-        return []
-    return [f"the commonest answer of each sub-scenario is right in {accuracy:.3f}, at most {PRIOR_AT_MOST} allowed"]
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:

@@ -88,16 +88,13 @@ def make_clips(pair: RecordedPair, folder: Path) -> RecordedClips:
 
 def video_path(folder: Path, name: str) -> Path:
     """Return the path of a video below a folder. Raises UnusableFootage."""
-    try:
+    with suppress(OSError, RuntimeError):  # a name that is too long, or links in a circle
         path = (folder / name).resolve()
-        is_there, is_inside = path.is_file(), path.is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # a name that is too long, or links in a circle
-        is_there, is_inside, path = False, True, folder
-    if not is_inside:
-        raise UnusableFootage("lies outside the folder; copy it into it")
-    if not is_there:
-        raise UnusableFootage("is not there; correct its path, which begins in the folder")
-    return path
+        if not path.is_relative_to(folder.resolve()):
+            raise UnusableFootage("lies outside the folder; copy it into it")
+        if path.is_file():
+            return path
+    raise UnusableFootage("is not there; correct its path, which begins in the folder")
 
 
 def _require_alike(frames: Sequence[np.ndarray], others: Sequence[np.ndarray], side: str) -> None:

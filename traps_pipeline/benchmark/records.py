@@ -131,11 +131,8 @@ def parse_two_events(line: str, where: str) -> TwoEventsSpec:
     """Parse a line of records of two events. Raises TrapsError."""
     from traps_pipeline.scenes.worlds.lane_records import RecordedEvents, TwoEventsSpec
 
-    def kind(fields: Any) -> type[TwoEventsSpec]:
-        is_recorded = isinstance(fields, dict) and fields.get("family") == RECORDED
-        return RecordedEvents if is_recorded else TwoEventsSpec
-
-    return _parse(kind, line, where)
+    kinds = {True: RecordedEvents, False: TwoEventsSpec}
+    return _parse(lambda fields: kinds[isinstance(fields, dict) and fields.get("family") == RECORDED], line, where)
 
 
 def _parse(kind: Callable[[Any], type[Record]], line: str, where: str) -> Record:

@@ -16,22 +16,8 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec
 _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a trajectory
 
 
-def unanswerable_controls(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return control certificates that the stored evidence fails, one sentence each."""
-    return _failures(specs, "control")
-
-
-def answerable_voids(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return void certificates that the stored evidence fails, one sentence each."""
-    return _failures(specs, "void", "twin", "worlds")
-
-
-def answerable_ill_posed(specs: Iterable[SceneSpec]) -> list[str]:
-    """Return problems of ill-posed questions: unrefuted, or well-posed ones refuted."""
-    return _failures(specs, "words")
-
-
-def _failures(specs: Iterable[SceneSpec], *about: About) -> list[str]:
+def failed_certificates(specs: Iterable[SceneSpec], *about: About) -> list[str]:
+    """Return certificates about these subjects that the stored evidence fails, one sentence each."""
     judged = ((spec.scenario_id, *parts) for spec in specs for parts in judged_certificates(spec, *about))
     return [f"{id_}: {certificate.name}: {failure}" for id_, certificate, _, failure in judged if failure is not None]
 

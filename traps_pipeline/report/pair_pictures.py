@@ -42,9 +42,9 @@ class Picture:
         """Return figures by file name. Raises NotRun, or TrapsError for a damaged clip."""
         return _require_clips(self.make)
 
-    def shown(self) -> Any:
-        """Return what the picture shows, as JSON. Raises TrapsError for a damaged clip."""
-        return _require_clips(self.inputs)
+    def shown(self, said: str) -> Any:
+        """Return what the picture shows and what is said below, as JSON. Raises TrapsError for a damaged clip."""
+        return [_require_clips(self.inputs), said]
 
 
 Found = TypeVar("Found")

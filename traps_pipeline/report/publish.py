@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +68,9 @@ def report_parts(sources: Sources, address: LinkOf | None = explorer_address) ->
         )
         for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
-    certified = sources.study.certified
+    said = sources.study.certified
     pictures = [
-        Part(
-            "pictures",
-            each.name,
-            lambda each=each: picture_card(each, certified),
-            each.reads,
-            lambda each=each: [each.shown(), certified],
-        )
+        Part("pictures", each.name, partial(picture_card, each, said), each.reads, partial(each.shown, said))
         for each in PairPictures(sources.workspace).all()
     ]
     tables = [

@@ -43,10 +43,6 @@ class LaneRecord(_Record):
     ground_truth: str
     twin: LaneTwin
 
-    def asked(self, question: str) -> str:
-        """Return the family's question about this lane."""
-        return lane_question(self.lane.strip, question)
-
 
 class TwoEventsSpec(_Record):
     """A scenario of two lanes, resolved. question: the family's own, of both lanes."""
@@ -106,7 +102,7 @@ class TwoEventsSpec(_Record):
         """Yield the eight items' questions, four of which can be answered."""
         for item in lane_items(self.scenario_id):
             record = self.lanes[LANES.index(item.lane)]
-            yield LaneQuestion(item, record.asked(self.question), record.ground_truth)
+            yield LaneQuestion(item, _asked(self.question, record), record.ground_truth)
 
 
 class RecordedLane(_Record):
@@ -120,10 +116,6 @@ class RecordedLane(_Record):
     cover: list[int] = Field(min_length=4, max_length=4)
     hides: list[tuple[int, int]]
     stands: list[tuple[int, int]]
-
-    def asked(self, question: str) -> str:
-        """Return the question about this event."""
-        return question.replace("{}", self.name)
 
 
 class RecordedEvents(TwoEventsSpec):
@@ -146,6 +138,11 @@ class RecordedEvents(TwoEventsSpec):
         if "{}" not in self.question or {*self.clips} != {*CLIPS}:
             raise ValueError(f"question: needs {{}} for the name of an event, and clips: each of {', '.join(CLIPS)}")
         return self
+
+
+def _asked(question: str, record: LaneRecord | RecordedLane) -> str:
+    is_recorded = isinstance(record, RecordedLane)
+    return question.replace("{}", record.name) if is_recorded else lane_question(record.lane.strip, question)
 
 
 @dataclass(frozen=True)
