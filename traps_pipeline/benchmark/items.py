@@ -81,15 +81,14 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     if dataset == TWO_EVENTS:
         lanes = [scenario.spec for scenario in load_two_events(workspace.study).values()]
         current = {(asked.item.item_id, asked.text, tuple(spec.labels)) for spec in lanes for asked in spec.questions()}
-        rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
-        rows = [row for row in rows if (row["item_id"], row["question"], tuple(row["labels"])) in current]
-        return [{str(name): value for name, value in row.items()} for row in rows]
+        rows = records(workspace.tables.read_all(ITEMS, dataset=dataset))
+        return [row for row in rows if (row["item_id"], row["question"], tuple(row["labels"])) in current]
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
     if dataset in UNPAIRED:
         stored_hashes = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
         unchanged = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*stored_hashes}}
-        rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
-        return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in unchanged]
+        rows = records(workspace.tables.read_all(ITEMS, dataset=dataset))
+        return [row for row in rows if row["scenario_id"] in unchanged]
     scenes = {spec["scenario_id"]: spec["scene_hash"] for spec in specs}
     clips: dict[tuple[str, str], Record] = {
         (row["scenario_id"], row["side"]): row

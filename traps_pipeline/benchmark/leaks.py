@@ -28,11 +28,8 @@ _TINY, _ALIKE_LEVELS = (16, 12), 8  # size of a near duplicate's pictures, by ho
 
 def measure_leaks(records: Sequence[SceneSpec], out: Path) -> str:
     """Write FILE below `out`: a row a cue and dataset; return tables and remarks as lines of text."""
-    looks = {
-        (r.scenario_id, side): _look(clip_path(out / "released", r.scenario_id, side))
-        for r in records
-        for side in SIDES
-    }
+    folder = out / "released"
+    looks = {(r.scenario_id, side): _look(clip_path(folder, r.scenario_id, side)) for r in records for side in SIDES}
     rows = [*_rows(records, looks)]
     write_text(out / FILE, json.dumps(rows, indent=1) + "\n")
     cells = [(row["dataset"], row["cue"], row["n_pairs"], f"{row['j']:+.2f} ± {row['half_width']:.2f}") for row in rows]

@@ -20,7 +20,7 @@ from traps_pipeline.base.yamlfile import check_line, faults_of, read_unchecked_l
 from traps_pipeline.scenes.worlds.spec import Slug, check_labels
 
 TABLES = ("pairs.csv", "pairs.jsonl")
-MAX_ROWS, MAX_BYTES = 10_000, 64 * 2**20
+MAX_ROWS = 10_000
 _VOIDS = ("void", "cut_s", "cover")
 Text = Annotated[str, Field(min_length=1, max_length=2000)]
 Seconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
@@ -149,8 +149,6 @@ def _rows(table: Path) -> Iterator[tuple[int, dict[str, Any] | str]]:
             yield number, row if isinstance(row, dict | str) else "is no JSON object"
         return
     try:
-        if table.stat().st_size > MAX_BYTES:
-            raise ValueError("is larger than 64 MB")
         text = io.StringIO(table.read_text(encoding="utf-8-sig"), newline="")
         for row in (reader := csv.DictReader(text, restkey="more values than names", strict=True)):
             yield reader.line_num, {name: value for name, value in row.items() if value not in ("", None)}
