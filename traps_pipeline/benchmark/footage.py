@@ -74,8 +74,8 @@ def _read(container: Any, start_s: float, end_s: float | None) -> Footage:
     frames, last, seen = list[np.ndarray](), None, (width, height)
     for frame in _shown(_decoded(container, stream, start_s), start_s, end_s):
         if last is None:  # as a player shows it: square pixels, turned as the camera was
-            seen = round(frame.width * float(stream.sample_aspect_ratio or 1)), frame.height
-            seen = seen[::-1] if frame.rotation % 180 else seen
+            across, down = round(frame.width * float(stream.sample_aspect_ratio or 1)), frame.height
+            seen = (down, across) if frame.rotation % 180 else (across, down)
         frames.append(frames[-1] if frame is last else _upright(frame, (width, height), seen))
         last = frame
     promised = min(math.inf if end_s is None else end_s, float(declared)) if stream.duration else 0.0
