@@ -126,7 +126,7 @@ def _lane_items(workspace: Workspace) -> list[ItemRow]:
     if not two_events_lines():
         raise TrapsError(
             f"{TWO_EVENTS_RELEASED}: holds no records of two events, as a benchmark drawn before 0.4.0; add some by "
-            f"`traps benchmark sample --two-events 8`, or leave {TWO_EVENTS} out of the experiment's datasets"
+            f"`traps benchmark sample --two-events 8` or an import, or leave {TWO_EVENTS} out of the datasets"
         )
     if not rows:
         raise TrapsError(
