@@ -282,7 +282,7 @@ def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
         row_of = {item: rows[scenario, item.name] for item in lane_items(scenario)}
         path_of = {item.clip: row["clip"] if row["clip"] in clips else None for item, row in row_of.items()}
         evidence = {item.lane: json.loads(row["evidence"]) for item, row in row_of.items()}
-        n_frames, fps = next((row["n_frames"], each["fps"]) for row in row_of.values() for each in evidence.values())
+        n_frames, fps = int(next(iter(row_of.values()))["n_frames"]), evidence[LANES[0]]["fps"]
         standing = [sum(a <= k < b for lane in LANES for a, b in evidence[lane]["stands"]) for k in range(n_frames)]
         of_items = [{name: getattr(i, name) for name in ("pair_id", "side", "lane", "clip")} for i in row_of]
         scenarios.append(
