@@ -163,6 +163,7 @@ def test_a_recording_of_two_events_becomes_eight_questions(tmp_path: Path) -> No
         (TWO_EVENTS | {"question": "Which side?"}, "for {} in the question"),
         (TWO_EVENTS | {"two_events": "red|red"}, "two names"),
         (TWO_EVENTS | {"cover": "1 2 0 0 90 90|1 2 80 0 90 90"}, "stand side by side"),
+        (TWO_EVENTS | {"control_cover": "1 2 0 0 90 90|1 2 80 0 90 90"}, "stand side by side"),
     ],
 )
 def test_a_wrong_line_gets_one_sentence(tmp_path: Path, row: dict[str, str], reason: str) -> None:

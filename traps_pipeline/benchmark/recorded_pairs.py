@@ -108,7 +108,7 @@ class RecordedPair(BaseModel):
             raise ValueError("ill_posed_question: is missing; add it")
         if self.two_events and (given != ["cover"] or len({*self.two_events}) != 2 or "{}" not in self.question):
             raise ValueError("two_events are two names with | between, for {} in the question, and a cover for each")
-        if self.two_events and self.cover[0].x + self.cover[0].width > self.cover[1].x:
+        if self.two_events and max(b.x + b.width for b in boards[::2]) > min(b.x for b in boards[1::2]):
             raise ValueError("two_events stand side by side: name the left one first, with boards that do not overlap")
         return self
 
