@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.recorded_clips import clip_path
 from traps_pipeline.protocol.datasets import SIDES, datasets_of_category
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 
-FOLDS = 5
+FOLDS, LISTED = 5, 20  # near duplicates that are named
 FILE = "leaks.json"  # in the benchmark's folder
 NUMBERS = ("clip length", "file size", "bytes a frame", "brightness", "detail", "motion at the end")
 _PICTURE = (32, 24)  # pixels of a first or last frame that a classifier sees
@@ -37,7 +37,9 @@ def measure_leaks(records: Sequence[SceneSpec], out: Path) -> str:
     lines += [] if rows else [f"what gives voids away: not measured, since no dataset has {FOLDS} pairs"]
     alone = sum("cover" in spec.void and "control_cover" not in spec.evidence for spec in records)
     board = f"a board comes in the void alone in {count_noun(alone, 'pair')}, which tells sides: give control_cover"
-    return "\n".join([*lines, *([board] if alone else []), *_near_duplicates(looks)])
+    alike = [*_near_duplicates(looks)]
+    more = [f"and {len(alike) - LISTED:,} more such pairs"] if len(alike) > LISTED else []
+    return "\n".join([*lines, *([board] if alone else []), *alike[:LISTED], *more])
 
 
 def _look(clip: Path) -> dict[str, Any]:
