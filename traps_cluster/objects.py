@@ -23,7 +23,7 @@ from traps_cluster.bucket import Bucket, object_name
 from traps_cluster.object_names import CurrentObject, ObjectNames
 from traps_cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import is_same_file, replace_by_link, write_bytes
+from traps_pipeline.base.files import replace_by_link, write_bytes
 from traps_pipeline.storage.place import STUDY, Place
 from traps_pipeline.storage.store import GRACE_DAYS, FolderStore, Store, UnusedObject, is_hidden
 from traps_pipeline.storage.study import FORMAT, Study
@@ -116,7 +116,7 @@ class ObjectStore(Store):
         def one(known: tuple[Path, CurrentObject]) -> None:
             path, row = known
             cached = self._fetched(row)
-            if cached is not None and not is_same_file(path, cached):
+            if cached is not None and not _is_same_file(path, cached):
                 replace_by_link(cached, path)
 
         _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
@@ -252,3 +252,11 @@ def open_store(place: Place, root: Path, study: Study | None = None) -> Store | 
             raise TrapsError(f"{place}/{STUDY}: is not what `traps init` wrote ({error})") from None
     ledger = open_ledger(variable, name)
     return FolderStore(root, ledger.lease) if isinstance(place, Path) else _store(root, _bucket(place), ledger)
+
+
+def _is_same_file(first: Path, second: Path) -> bool:
+    """Return whether two paths name one existing file."""
+    try:
+        return first.samefile(second)
+    except FileNotFoundError:
+        return False

@@ -177,14 +177,6 @@ def _finish_replacement(path: Path, former: Path) -> None:
     shutil.rmtree(former)
 
 
-def is_same_file(first: Path, second: Path) -> bool:
-    """Return whether two paths name one existing file."""
-    try:
-        return first.samefile(second)
-    except FileNotFoundError:
-        return False
-
-
 def replace_by_link(existing: Path, path: Path) -> None:
     """Hard-link a file to `path`, replacing any there (safe: files are never edited)."""
     path.parent.mkdir(parents=True, exist_ok=True)
