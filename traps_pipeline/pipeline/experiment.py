@@ -188,7 +188,7 @@ def load_experiment(name: str) -> Experiment:
             )
         if physical := [
             *(model for model in experiment.models if get_model(model).backend in ("observer", "rule")),
-            *(dataset for dataset in experiment.datasets if dataset in UNPAIRED),
+            *(dataset for dataset in experiment.datasets if dataset in UNPAIRED and dataset != TWO_EVENTS),
         ]:
             refuse_recorded(", ".join(physical))
         for model in experiment.mechanism.models if experiment.mechanism else ():
