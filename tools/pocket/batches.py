@@ -224,7 +224,7 @@ class Batches:
         pieces = [self._pieces(look, prompt_name, grid) for look in looks]
         head = self._ids(pieces[0][0])
         clips = [[self._ids(part) for part in clip] for _, clip, _ in pieces]
-        talks = [[(self._ids(text), self._ids(answer)) for text, answer in questions] for _, _, questions in pieces]
+        talks = [[tuple(map(self._ids, texts)) for texts in questions] for _, _, questions in pieces]
         names = [self._scenes.names(look.scene, look.side, look.pairs) for look in looks]
         rows = self._rows(head, clips, [look.pairs for look in looks], talks, grid[1:])
         return Batch(
@@ -239,10 +239,10 @@ class Batches:
 
     def _pieces(
         self, look: Look, prompt_name: str, grid: tuple[int, int, int]
-    ) -> tuple[str, list[str], list[tuple[str, str]]]:
+    ) -> tuple[str, list[str], list[tuple[str, str, str]]]:
         """Return the chat as the processor writes it, cut into pieces: the system's part; the whole clip, in which all
         but the first and the last piece are a pair of frames each, as a time stamp and placeholders for tokens; and for
-        each question its text with the beginning of the answer, and the answer."""
+        each question its text with the beginning of the answer, the answer, and its hint."""
         processor, token = self._processor, self._processor.video_token
         times = self._scenes.times(look.scene, look.side)
         pairs = [
@@ -257,7 +257,7 @@ class Batches:
         end = processor.tokenizer.eos_token
         labels = [self._scenes.label(look, question, prompt_name) for question in look.questions]
         questions = [
-            (question.question + after, say(label, prompt_name) + end)
+            (question.question + after, say(label, prompt_name) + end, question.hint or "")
             for question, label in zip(look.questions, labels, strict=True)
         ]
         return head, [user + before, *pairs, between], questions
@@ -283,7 +283,7 @@ class Batches:
         head: list[int],
         clips: list[list[list[int]]],
         shown: list[tuple[int, ...] | None],
-        talks: list[list[tuple[list[int], list[int]]]],
+        talks: Sequence[Sequence[Sequence[list[int]]]],
         grid: tuple[int, int],
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """ids, labels, sees and positions of `Batch`. clips: in pieces, as `_pieces` says; shown: the pairs of frames
@@ -292,7 +292,7 @@ class Batches:
 
         rows = [self._placed(head, *clip, grid) for clip in zip(clips, shown, strict=True)]
         longest = max(
-            len(clip) + sum(len(question) + len(answer) for question, answer in talk)
+            len(clip) + sum(len(question) + len(answer) for question, answer, _ in talk)
             for (clip, _, _), talk in zip(rows, talks, strict=True)
         )
         ids = torch.full((len(clips), longest), self._processor.tokenizer.pad_token_id)
@@ -302,10 +302,11 @@ class Batches:
             at = len(clip)
             ids[i, :at], part[i, :at] = clip, 0
             positions[:, i, : len(head) + at] = placed
-            for number, (question, answer) in enumerate(talk, start=1):
+            for number, (question, answer, hint) in enumerate(talk, start=1):
                 end = at + len(question) + len(answer)
                 ids[i, at:end], part[i, at:end] = torch.tensor(question + answer), number
                 labels[i, at + len(question) : end] = torch.tensor(answer)
+                labels[i, at + 2 : at + 2 + 2 * len(hint)] = torch.tensor(2 * hint)
                 positions[:, i, len(head) + at : len(head) + end] = torch.arange(free, free + end - at)
                 at = end
         own = (part[:, :, None] == part[:, None, :]) | (part == 0)[:, None, :]

@@ -47,12 +47,14 @@ class Question:
     """A question and the answer that the model is trained to give: a label, a guess, or None for an abstention.
 
     draw: of a question whose label depends on the prompt, a number in [0, 1); under a prompt with a larger share of
-    abstentions the label is an abstention, and else `answer`: of a void a guess.
+    abstentions the label is an abstention, and else `answer`: of a void a guess. hint: a token that training asks for
+    behind the question's second and third token too, so that a model learns what decides where that is named.
     """
 
     question: str
     answer: str | None
     draw: float | None = None
+    hint: str | None = None
 
     def label(self, share: float) -> str | None:
         """Return the answer under a prompt with that share of abstentions."""
@@ -330,7 +332,7 @@ def data_digest(recipe: Recipe, split: Split, folder: Path) -> str:
     """Return SHA-256 over the digests of all files of a split that training reads, in the order of the shards. For a
     shard with more scenes than in the recipe, the digest is that of files with only the recipe's scenes."""
     hasher = hashlib.sha256()
-    for job, _ in read_shards(recipe, split, folder):
+    for job, _ in read_shards(recipe, split, folder, str):
         for path in (job.lines, job.pixels) if split == "train" else (job.lines,):
             of_file = file_digest(path) if job.drawn == job.count else hashlib.sha256(_first(job, path)).hexdigest()
             hasher.update(of_file.encode())

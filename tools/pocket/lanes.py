@@ -112,7 +112,7 @@ def draw_shard(job: ShardJob) -> int:
             break
         rng = np.random.default_rng([*stream, attempt])
         try:
-            (world, *_), wording = draw_worlds(family, attempt + 1, rng, int(rng.integers(2**31)))
+            (world, *_), wording = draw_worlds(family, attempt + 1, rng, int(rng.integers(2**31)), is_alike=False)
             scene = _scene(world, wording, job.recipe.media)
         except Rejected:
             continue
@@ -209,21 +209,21 @@ class LaneScenes(Clips[LaneScene]):
         return question.label(self._recipe.share(prompt_name, "", void=question.draw is not None))
 
     def look(self, rng: np.random.Generator, void_share: float) -> Look:
-        """Return a random clip with both its questions, and two for the places of its strips. void_share: of clips that
+        """Return a random clip with both its questions, and one for the place of a strip. void_share: of clips that
         hide exactly one lane; the others hide none or both."""
         scene, one = int(rng.integers(len(self.records))), rng.random() < void_share
         sides = [n for n, hidden in enumerate(CLIPS.values()) if (sum(hidden) == 1) == one]
         side = sides[int(rng.integers(len(sides)))]
         record, hidden = self.records[scene], [*CLIPS.values()][side]
-        asked = []
-        for k in rng.permutation(len(LANES)):
-            text, strip = record.questions[k], record.strips[k]
-            asked.append(
-                Question(text, guess(text, record.labels, rng), rng.random())
-                if hidden[k]
-                else Question(text, record.answers[k])
-            )
-            asked.append(Question(side_question(strip)[0], LANES[k]))
+        known = [
+            Question(text, answer, hint=ANSWER) for text, answer in zip(record.questions, record.answers, strict=True)
+        ]
+        unknown = [
+            Question(text, guess(text, record.labels, rng), rng.random(), ABSTENTION) for text in record.questions
+        ]
+        asked = [(unknown if hidden[k] else known)[k] for k in range(len(LANES))]
+        half = int(rng.integers(len(LANES)))
+        asked.append(Question(side_question(record.strips[half])[0], LANES[half]))
         return Look(scene, side, tuple(asked))
 
 

@@ -93,6 +93,11 @@ def start_from(model: Any, tokenizer: Any, weights: Path) -> None:
 
 
 def save(model: Any, processor: Any, folder: Path) -> None:
-    """Write the folder that `checkpoint:` of a local model's entry names."""
+    """Write the folder that `checkpoint:` of a local model's entry names; weights in half precision, since several
+    models ship, and read back as float32."""
+    from safetensors.torch import load_file, save_file
+
     model.save_pretrained(folder)
     processor.save_pretrained(folder)
+    weights = folder / "model.safetensors"
+    save_file({name: values.half() for name, values in load_file(weights).items()}, weights, {"format": "pt"})

@@ -17,6 +17,7 @@ POCKET = ASSETS / "pocket"
 RECIPE = POCKET / "recipe.yaml"
 GAP, NO_GAP = "pocket", "pocket-no-gap"  # their entries in models.yaml
 SHIPPED = {GAP: POCKET, NO_GAP: POCKET / "no_gap"}  # folder of each: recipe, weights, facts, figures
+LANES = POCKET / "lanes"  # of `pocket-lanes`: the same
 Split = Literal["train", "held-out"]
 
 

@@ -115,11 +115,17 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
 
 
 def draw_worlds(
-    family: Family, number: int, rng: np.random.Generator, seed: int, difficulty: Difficulty = DEFAULT_DIFFICULTY
+    family: Family,
+    number: int,
+    rng: np.random.Generator,
+    seed: int,
+    difficulty: Difficulty = DEFAULT_DIFFICULTY,
+    *,
+    is_alike: bool = True,
 ) -> tuple[tuple[TwoLanes, TwoLanes, TwoLanes], Wording]:
     """Return a world, those with the left and the right lane's twin, and the words for both. Raises Rejected.
 
-    Nothing is certified.
+    Nothing is certified. is_alike: doubles have about as many pixels as the things, which are drawn for it.
     """
     first = _event(family, rng, None, difficulty)
     pairs = [first, _event(family, rng, first[0].params, difficulty)][:: 1 if rng.integers(2) else -1]
@@ -134,7 +140,7 @@ def draw_worlds(
     above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
     strips = _strips(wording, pairs, rng)
     lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
-    sizes = _sizes(_worlds(lanes, pairs, look))
+    sizes = _sizes(_worlds(lanes, pairs, look)) if is_alike else [uniform(rng, *SIZES) for _ in LANES]
     lanes = [replace(lane, size=size * uniform(rng, *ALIKE)) for lane, size in zip(lanes, sizes, strict=True)]
     lanes = [replace(lane, size=round(float(np.clip(lane.size, *SIZES)), 3)) for lane in lanes]
     return _worlds(lanes, pairs, look), wording
