@@ -7,7 +7,9 @@ paths that people and code use. The digest of every content that is read is comp
 
 from __future__ import annotations
 
+import os
 import re
+import secrets
 from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
@@ -23,7 +25,7 @@ from traps_cluster.bucket import Bucket, object_name
 from traps_cluster.object_names import CurrentObject, ObjectNames
 from traps_cluster.postgres import PostgresDatabase, open_ledger
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.files import replace_by_link, write_bytes
+from traps_pipeline.base.files import write_bytes
 from traps_pipeline.storage.place import STUDY, Place
 from traps_pipeline.storage.store import GRACE_DAYS, FolderStore, Store, UnusedObject, is_hidden
 from traps_pipeline.storage.study import FORMAT, Study
@@ -117,7 +119,7 @@ class ObjectStore(Store):
             path, row = known
             cached = self._fetched(row)
             if cached is not None and not _is_same_file(path, cached):
-                replace_by_link(cached, path)
+                _replace_by_link(cached, path)
 
         _side_by_side(one, self._known(path for path in paths if path.is_relative_to(self.root)).items())
 
@@ -148,7 +150,7 @@ class ObjectStore(Store):
     def _put(self, path: Path, content: bytes, note: str | None = None) -> CurrentObject:
         """Upload a content, and link it to its path; return its object, which is not yet named."""
         new = CurrentObject(sha256(content).digest(), len(content), note)
-        replace_by_link(self._cache(new.digest, content), path)
+        _replace_by_link(self._cache(new.digest, content), path)
         self.bucket.put(object_name(new.digest), content)
         self._stored.add(new.digest)
         return new
@@ -260,3 +262,14 @@ def _is_same_file(first: Path, second: Path) -> bool:
         return first.samefile(second)
     except FileNotFoundError:
         return False
+
+
+def _replace_by_link(existing: Path, path: Path) -> None:
+    """Hard-link a file to `path`, replacing any there (safe: files are never edited)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        os.link(existing, part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

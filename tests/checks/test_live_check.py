@@ -268,6 +268,27 @@ def test_a_model_is_tried_with_a_schema_only_if_the_run_asks_for_one(
         assert bodies and sum("response_format" in body for body in bodies) == asked
 
 
+@pytest.mark.parametrize(
+    ("regimes", "declared", "codes"),
+    [
+        (["standard"], "", [0, 0]),
+        (["standard", "logprobs"], "", [1, 1]),
+        (["standard", "logprobs"], ", logprobs: true, top_logprobs: 20", [0, 0]),
+    ],
+)
+def test_a_model_without_log_probabilities_is_named_only_if_the_run_scores_them(
+    unasked: Checkout, provider: Provider, regimes: list[str], declared: str, codes: list[int]
+) -> None:
+    model = network_entry(NAME, "images").replace("max_tokens: 8000", f"max_tokens: 8000{declared}")
+    path = experiment(unasked, provider, [model], regimes=regimes, budget_usd=50.0)
+    done = [
+        unasked.traps(*command)
+        for command in (["models", "check", path, "--live"], ["run", path, "--until", "responses"])
+    ]
+    assert [command.code for command in done] == codes, done
+    assert all(("top_logprobs" in command.out + command.err) == bool(command.code) for command in done)
+
+
 @pytest.mark.parametrize(("typed", "code"), [("n\n", 1), ("y\n", 0)])
 def test_a_run_in_a_terminal_asks_before_it_goes_on_unchecked(
     unasked: Checkout, provider: Provider, typed: str, code: int

@@ -14,7 +14,7 @@ from tests.conftest import ROOT, Checkout
 from traps_pipeline.definitions import defs
 from traps_pipeline.pipeline.graph import JOB_GROUPS, the_graph
 from traps_pipeline.pipeline.run import dagster_history
-from traps_pipeline.pipeline.runs import JOB_TAG, PARENT_TAG, ROOT_TAG, LocalRuns
+from traps_pipeline.pipeline.runs import JOB_RUN_TAG, JOB_TAG, LocalRuns
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -42,13 +42,13 @@ def test_every_job_succeeds_in_its_turn_from_an_empty_study(empty: Checkout, mon
     assert (empty.workspace / "reports" / "report.html").exists()
     runs = {run.run_id: run for run in runs_of(empty, monkeypatch)}
     assert {run.status for run in runs.values()} == {dg.DagsterRunStatus.SUCCESS}
-    started = [run for run in runs.values() if PARENT_TAG in run.tags]
+    started = [run for run in runs.values() if JOB_TAG in run.tags]
     # Specs, clips and arms are one run, items another; then answers to verdicts; metrics, and what hangs on them.
-    assert [runs[run.tags[PARENT_TAG]].job_name for run in started[::-1]] == [
+    assert [runs[run.tags[JOB_RUN_TAG]].job_name for run in started[::-1]] == [
         *("benchmark", "benchmark", "evaluation", "scoring", "scoring"),
     ]
-    assert all(run.tags[ROOT_TAG] == run.tags[PARENT_TAG] for run in started)
-    assert all(run.tags[JOB_TAG] == runs[run.tags[PARENT_TAG]].job_name for run in started)
+    assert all(run.parent_run_id is None for run in started)  # a run with a parent is a re-execution in the pages
+    assert all(run.tags[JOB_TAG] == runs[run.tags[JOB_RUN_TAG]].job_name for run in started)
 
 
 def test_a_job_that_is_stopped_leaves_no_failed_run_behind(empty: Checkout, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,7 +58,7 @@ def test_a_job_that_is_stopped_leaves_no_failed_run_behind(empty: Checkout, monk
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
     process.communicate()
-    [started] = [run for run in runs_of(empty, monkeypatch) if PARENT_TAG in run.tags]
+    [started] = [run for run in runs_of(empty, monkeypatch) if JOB_TAG in run.tags]
     assert started.status == dg.DagsterRunStatus.CANCELED
 
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,12 @@ from tests.build.ledger import local
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.asking import participants
 from traps_pipeline.models.asking.answers import answer_request
-from traps_pipeline.models.asking.ask import run_work, settle
+from traps_pipeline.models.asking.ask import Call, run_work, settle
 from traps_pipeline.models.asking.draining import STOP_SIGNALS
 from traps_pipeline.models.registry.accounts import Limits
 from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.models.request import Outcome, Request, TransientError
-from traps_pipeline.protocol.cells import Evaluation
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -128,6 +129,54 @@ def test_calls_in_flight_are_recorded_when_another_call_of_the_cell_fails(tmp_pa
         ask(tmp_path, backend, TEN)
     assert backend.calls == ["item-0", "item-1", "item-2", "item-3"]  # four at once, none begun afterwards
     assert len(kept(tmp_path)) == 3
+
+
+DATASETS = ("chaotic", "occlusion", "occlusion_ill_posed")  # in the order of their cells
+
+
+def work_on_cells(root: Path, backend: Answering, items: Sequence[Sequence[int]]) -> Iterator[dict[str, Any]]:
+    """A run of one evaluation whose cells want these items."""
+    of_cell = dict(zip(DATASETS, items, strict=True))
+    cells = [Cell(dataset, CELL.evaluation) for dataset in DATASETS]
+    job = replace(work(root, {"m": backend}, []), calls=lambda cell: [Call(request(n)) for n in of_cell[cell.dataset]])
+    return run_work(job, cells)
+
+
+def test_a_cell_is_asked_while_the_last_call_of_the_one_before_is_in_flight(tmp_path: Path) -> None:
+    backend = Answering()
+    waits = {"item-0": "item-2", "item-2": "item-4"}  # answered once a call of the next cell has come
+
+    async def ask(asked: Request) -> Outcome:
+        item = str(asked.about["item_id"])
+        backend.calls.append(item)
+        async with asyncio.timeout(5):
+            while waits.get(item, item) not in backend.calls:
+                await asyncio.sleep(0.001)
+        return LEFT
+
+    backend.ask = ask  # type: ignore[method-assign]
+    finished = list(work_on_cells(tmp_path, backend, [[0, 1], [2, 3], [4, 5]]))
+    assert [one["cell"].dataset for one in finished] == [*DATASETS]
+    assert {row["outcome"] for one in finished for row in one["rows"]} == {"answer"}
+    assert sorted(backend.calls) == [f"item-{n}" for n in range(6)]
+
+
+def test_a_call_that_two_cells_share_is_asked_once_though_the_first_is_in_flight(tmp_path: Path) -> None:
+    backend = Answering(after_s=0.05)
+    finished = list(work_on_cells(tmp_path, backend, [[0, 1], [1, 2], [2, 0]]))
+    assert backend.calls == ["item-0", "item-1", "item-2"]
+    assert [len(one["rows"]) for one in finished] == [2, 2, 2]
+
+
+def test_after_a_failure_no_further_cell_is_asked_and_calls_in_flight_are_recorded(tmp_path: Path) -> None:
+    cannot = ValueError("cannot be sent")
+    backend = Answering(lambda asked, _: cannot if asked.about["item_id"] == "item-2" else LEFT, after_s=0.05)
+    finished = list[dict[str, Any]]()
+    with raises(ValueError, "models.asking.participants._send"):
+        finished.extend(work_on_cells(tmp_path, backend, [[0, 1], [2, 3], [4, 5]]))
+    assert [one["cell"].dataset for one in finished] == ["chaotic"]
+    assert [*backend.calls] == ["item-0", "item-1", "item-2", "item-3"]
+    assert {*kept(tmp_path)} == {"item-0", "item-1", "item-3"}
 
 
 def drained(root: Path, backend: Answering, stop: asyncio.Event) -> list[Any]:

@@ -12,7 +12,7 @@ from dagster._core.storage.asset_check_execution_record import AssetCheckExecuti
 
 from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.pipeline.automation import report_unseen, sensors
+from traps_pipeline.pipeline.automation import report_outdated, sensors
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.history import History
 from traps_pipeline.pipeline.lineage import OTHER_COLUMNS, Lineage, Status
@@ -134,7 +134,7 @@ def test_damage_and_a_loss_are_reported_again_after_a_restart_of_the_daemon(stud
         for last in (False, False, True):  # a new process has reported nothing yet
             if last:
                 path.unlink()
-            report_unseen(instance, RunPlan(study), reported := dict[str, str]())
+            report_outdated(instance, RunPlan(study), reported := dict[str, str]())
             assert reported and str(tmp_path) not in str(reported)  # the page of the sensor shows its cursor
         key = dg.AssetCheckKey(dg.AssetKey("verdicts"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
@@ -154,11 +154,11 @@ def test_a_stale_cell_is_told_in_one_line_until_it_is_made_again(study: Workspac
         instance.report_runless_asset_event(History(instance, graph).event(graph["metrics"], "chaotic", "1", {}, {}))
         decide(study, CELL, abstained=False)
         decide(study, CELL | {"model": "oracle"}, abstained=True)
-        report_unseen(instance, RunPlan(study), reported)
+        report_outdated(instance, RunPlan(study), reported)
         assert [*reported] == ["metrics/chaotic"] and len(reported["metrics/chaotic"].splitlines()) == 1
         assert "(and 1 more)" in reported["metrics/chaotic"]
         score(study, graph["metrics"].code)
-        report_unseen(instance, RunPlan(study), reported)
+        report_outdated(instance, RunPlan(study), reported)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     results = [each.event.dagster_event.asset_check_evaluation_data for each in stored]  # pyright: ignore
     assert [(each.partition, each.passed) for each in results] == [(None, True), ("chaotic", False)] and not reported
@@ -195,9 +195,9 @@ def test_a_loss_is_told_each_time_that_it_happens_and_taken_back_once_it_is_repa
         for _ in range(2):
             path.unlink()
             for _ in range(2):
-                report_unseen(instance, RunPlan(study), reported)
+                report_outdated(instance, RunPlan(study), reported)
             score(study, graph["metrics"].code)
-            report_unseen(instance, RunPlan(study), reported)
+            report_outdated(instance, RunPlan(study), reported)
         key = dg.AssetCheckKey(dg.AssetKey("metrics"), CURRENT)
         stored = instance.event_log_storage.get_asset_check_execution_history(key, limit=9)
     passed = [each.event.dagster_event.asset_check_evaluation_data.passed for each in stored]  # pyright: ignore

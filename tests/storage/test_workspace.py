@@ -126,3 +126,15 @@ def test_a_folder_with_other_signs_keeps_a_history(name: str, tmp_path: Path, mo
     with dagster_history(workspace) as history:
         assert history.get_runs() == []
     assert (tmp_path / name / "dagster" / "dagster.yaml").is_file()
+
+
+def test_a_history_whose_settings_name_the_storage_of_0_3_0_is_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DAGSTER_HOME", str(tmp_path / "dagster"))
+    workspace = Workspace.create(tmp_path, Study(name="study"))
+    custom = {"module": "traps_pipeline.pipeline.event_storage", "class": "SqliteStorage"}
+    custom["config"] = {"base_dir": {"env": "DAGSTER_HOME"}}
+    (tmp_path / "dagster" / "dagster.yaml").write_text(yaml.safe_dump({"storage": {"custom": custom}}))
+    with dagster_history(workspace) as history:
+        assert history.get_runs() == []

@@ -47,7 +47,7 @@ def require_extra(name: ExtraName, *modules: str) -> None:
         raise TrapsError(_sentence(name, missing_modules))
 
 
-def sentence_of(error: ModuleNotFoundError) -> str | None:
+def missing_extra_sentence(error: ModuleNotFoundError) -> str | None:
     """Return the sentence of `require_extra` for an ImportError; None outside all extras."""
     module = (error.name or "").partition(".")[0]
     names: tuple[ExtraName, ...] = get_args(ExtraName)

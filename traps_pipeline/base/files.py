@@ -177,17 +177,6 @@ def _finish_replacement(path: Path, former: Path) -> None:
     shutil.rmtree(former)
 
 
-def replace_by_link(existing: Path, path: Path) -> None:
-    """Hard-link a file to `path`, replacing any there (safe: files are never edited)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        os.link(existing, part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def check_disk(folder: Path, least_gb: float) -> str:
     """Return a folder's free space in words; raise TrapsError if it is too small."""
     existing = next(path for path in (folder, *folder.parents) if path.exists())

@@ -32,7 +32,7 @@ class Tally:
     frames: int = 0
 
     def add(self, other: Tally) -> None:
-        """Add another tally in place."""
+        """Add another tally's counts to this one."""
         self.asked += other.asked
         self.cached += other.cached
         self.errors += other.errors

@@ -99,7 +99,7 @@ def text_table(headings: Sequence[str], rows: Iterable[Sequence[object]], left: 
         columns = shutil.get_terminal_size().columns
         while count > 1 and sum(widths[:count]) + _GAP * (count - 1) > columns:
             count -= 1
-        names = ", ".join(cells[0][count:])
+        names = ", ".join(map(str.strip, cells[0][count:]))
         hidden = "\n" + wrap_text(f"not shown in {columns} columns: {names}") if names else ""
     lines = list[str]()
     for row in cells:

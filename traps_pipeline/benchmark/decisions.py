@@ -48,7 +48,7 @@ def is_reviewed(decisions: Sequence[Correction]) -> bool:
 
 
 def save_decision(correction: Correction, n_seen: int, folder: Path = CORRECTIONS) -> None:
-    """Append a decision.
+    """Append a reviewer's decision to the corrections.
 
     n_seen: the number of decisions about the scenario that the reviewer knew of. Raises DecidedMeanwhile if there are
     more by now, and TrapsError if the decision does not fit the record; nothing is written then.

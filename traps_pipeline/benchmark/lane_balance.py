@@ -16,7 +16,7 @@ LARGEST_AUC, LARGEST_FAMILY_AUC, FAMILY_LANES = 0.6, 0.85, 16
 
 
 def lane_numbers(specs: Iterable[TwoEventsSpec]) -> pd.DataFrame:
-    """Return a row for each lane, seen and hidden: family, side, and numbers of what is in view of it.
+    """Return a row per lane, seen and hidden: family, side, and numbers of what its clip shows.
 
     Boards: whether one comes, moves and stands, at fixed shares of the clip and in all; pixels of boards and of things
     like the asked one. Where boards are follows from the side, so the two sides have the same timetable.

@@ -31,5 +31,5 @@ def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
 
 
 def spec_record(spec: SceneSpec) -> dict[str, Any]:
-    """Return a spec in the form that `item_content` reads."""
+    """Return a scenario's record in the form from which items' contents are digested."""
     return spec.model_dump(mode="json") | {"scene_hash": spec.scene_hash}

@@ -36,7 +36,7 @@ UNFINISHED_AFTER_S = 24 * 3600.0  # longer than the writing of any file
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one examination."""
+    """The result of one check of the machine by `traps doctor`."""
 
     ok: bool
     what: str

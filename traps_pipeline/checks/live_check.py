@@ -1,8 +1,8 @@
 """Check models and judges with live calls before money is spent.
 
 `traps models check --live` and the preflight of a run do. Each model is asked about a clip that is red and then blue,
-once with the clip and once without, and in its JSON form if a run may ask for it; each judge votes on answers with
-known votes. Every problem is a sentence that names the cause and the remedy.
+once with the clip and once without, and in each other form of an answer that a run may ask for; each judge votes on
+answers with known votes. Every problem is a sentence that names the cause and the remedy.
 """
 
 import asyncio
@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,10 @@ QUESTION = "The whole picture has one colour and then another: which two colours
 _FPS, _SIZE, _FRAMES = 10, (120, 160), 50
 _LATE = "timeout"  # the error of a call that may yet be answered
 _NO_SCHEMA = "say `json_schema: false` and `waivers: {json_schema: WHY}`"
+_NO_LOGPROBS = (
+    "its answer has no log-probabilities, which the regime logprobs scores: say `params: {logprobs: true, "
+    "top_logprobs: 20}`, or ask without that regime"
+)
 _JUDGED = (("I don't know.", True, False), ("The ball rolls down the ramp. The answer is: left.", False, True))
 _ITEM: Mapping[str, Any] = {
     "item_id": "preflight",
@@ -89,8 +94,11 @@ def _studio() -> SyntheticClip:
     return SyntheticClip([halves[2 * k // _FRAMES] for k in range(_FRAMES)], _FPS)
 
 
-def requests_of(entry: Entry, *, structured: bool = True) -> dict[str, Request]:
-    """Return an entry's new test calls by name. structured: whether a model is asked for an object of a schema, too."""
+def requests_of(entry: Entry, forms: Collection[str] | None = None) -> dict[str, Request]:
+    """Return an entry's new test calls by name.
+
+    forms: see `Experiment.forms`; None stands for all that the entry declares.
+    """
     now = datetime.now(UTC).isoformat()
     if isinstance(entry, JudgeEntry):
         tasks: tuple[Task, ...] = ("abstention", "correctness")
@@ -103,12 +111,14 @@ def requests_of(entry: Entry, *, structured: bool = True) -> dict[str, Request]:
         return {name: replace(call, about={**call.about, "check": name, "at": now}) for name, call in requests.items()}
     assert isinstance(entry, ModelEntry)
     clip_media = _studio().prepare(entry.media) if entry.media else None
-    forms = {"clip": ("standard", clip_media), "no clip": ("standard", None)}
-    if entry.json_schema and structured:
-        forms["schema"] = ("json", clip_media)
+    calls = {"clip": ("standard", clip_media), "no clip": ("standard", None)}
+    if entry.json_schema and (forms is None or "json" in forms):
+        calls["schema"] = ("json", clip_media)
+    if entry.params.get("logprobs") if forms is None else "logprobs" in forms:
+        calls["logprobs"] = ("logprobs", clip_media)
     return {
-        name: question(entry, regime, QUESTION, media, {"check": name, "at": now})
-        for name, (regime, media) in forms.items()
+        name: question(entry, regime, QUESTION, media, {"check": name, "at": now, "regime": regime})
+        for name, (regime, media) in calls.items()
     }
 
 
@@ -228,6 +238,8 @@ def _wrong_answers(entry: ModelEntry, outcomes: Mapping[str, Outcome]) -> list[s
         if thinking_mark := _undeclared_thinking(entry, outcome):
             messages.append(thinking_mark)
             continue
+        if name == "logprobs" and outcome.first_token is None:
+            messages.append(_NO_LOGPROBS)
         row = {"outcome": outcome.kind, "text": text}
         reading = read_answer(row, None, "json" if name == "schema" else "standard", thinking=entry.thinking)
         if reading.outcome == "degenerate":
@@ -265,10 +277,12 @@ def _clip_problems(entry: ModelEntry, outcomes: Mapping[str, Outcome], notes: li
 # --- asking -----------------------------------------------------------------------------------------------------------
 
 
-def check_live(entries: Iterable[Entry], unstructured: Collection[str] = ()) -> list[LiveResult]:
-    """Ask these entries in parallel, without a study; their cost is not recorded, but how long an answer takes.
+def check_live(
+    entries: Iterable[Entry], forms: Mapping[str, Collection[str] | None] = MappingProxyType({})
+) -> list[LiveResult]:
+    """Try models and judges with short calls in parallel, without a study; seconds are recorded, costs are not.
 
-    unstructured: ids of models whose runs ask for no object of a schema.
+    forms: by an entry's id, see `requests_of`.
     """
 
     async def every() -> list[LiveResult]:
@@ -293,7 +307,7 @@ def check_live(entries: Iterable[Entry], unstructured: Collection[str] = ()) -> 
                 seconds.append(TIMEOUT_S)  # at least
                 return Outcome("error", error=_LATE)
 
-        requests = requests_of(entry, structured=entry.id not in unstructured)
+        requests = requests_of(entry, forms.get(entry.id))
         outcomes = await asyncio.gather(*map(asked, requests.values()))
         if seconds:
             remember_latencies(entry, account.base_url, seconds)
@@ -303,9 +317,9 @@ def check_live(entries: Iterable[Entry], unstructured: Collection[str] = ()) -> 
 
 
 def preflight(
-    workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry], *, structured: bool
+    workspace: Workspace, models: Sequence[Entry], judges: Sequence[Entry], forms: Collection[str]
 ) -> list[LiveResult]:
-    """Check prices, then ask the models and judges of a run, under its budget; structured: see `requests_of`.
+    """Check prices, then ask the models and judges of a run, under its budget; forms: see `requests_of`.
 
     The calls are in the ledger of votes. Raises TrapsError if the study does not allow a participant's cost: judges are
     checked before a model is asked.
@@ -322,7 +336,7 @@ def preflight(
         for entry in entries
         if not server_checks[entry.id].problem
     }
-    requests = {name: requests_of(entry, structured=structured) for name, entry in quick_entries.items()}
+    requests = {name: requests_of(entry, forms) for name, entry in quick_entries.items()}
     calls = [Call(request) for entry_requests in requests.values() for request in entry_requests.values()]
     outcomes: Mapping[str, Outcome] = {}
     if calls:
@@ -344,7 +358,7 @@ def preflight(
 
 
 def _outcome(row: Row) -> Outcome:
-    names = ("text", "finish_reason", "error", "prompt_tokens", "served_model")
+    names = ("text", "finish_reason", "error", "prompt_tokens", "served_model", "first_token")
     return Outcome(row["outcome"], **{name: row.get(name) for name in names})
 
 

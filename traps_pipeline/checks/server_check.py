@@ -17,7 +17,7 @@ BAD_REQUEST = 400
 
 @dataclass(frozen=True)
 class ServerCheck:
-    """Findings before any call.
+    """What a server says of itself before any model is called.
 
     problem: why asking is useless; unlisted: the server's own list of models lacks the name; refused: the list, which
     needs only a key, is refused. Neither is certain: some servers list what was downloaded, or examples, and a litellm

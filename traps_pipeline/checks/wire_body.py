@@ -36,7 +36,7 @@ class WireBody:
 
     @cached_property
     def body(self) -> dict[str, Any]:
-        """The sent JSON, parsed."""
+        """The JSON body of the request as it was sent, parsed."""
         return json.loads(self.raw)
 
     @property

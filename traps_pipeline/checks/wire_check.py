@@ -198,7 +198,7 @@ class CheckedEntry:
 
 
 def examine(entry: Entry) -> CheckedEntry:
-    """Send the requests of an entry to this machine and compare them."""
+    """Compare what a model or judge is sent, caught on this machine, with what its entry declares."""
     if entry.backend == NETWORK:
         return _examine_network(entry)
     if isinstance(entry, ModelEntry) and entry.media is not None:
@@ -279,7 +279,7 @@ def participants() -> dict[str, Entry]:
 
 
 def check_named(names: Sequence[str]) -> Iterator[CheckedEntry]:
-    """Check these entries (default: all). Raises TrapsError for an unknown id."""
+    """Check what models and judges are sent (default: all). Raises TrapsError for an unknown id."""
     entries = participants()
     if unknown := [name for name in names if name not in entries]:
         raise TrapsError(f"unknown model or judge {', '.join(unknown)}; known: {', '.join(entries)}")

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from functools import cache
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.extras import sentence_of
+from traps_pipeline.base.extras import missing_extra_sentence
 from traps_pipeline.base.files import remedy
 from traps_pipeline.base.redaction import redact_tracebacks
 from traps_pipeline.base.terminal import plain
@@ -96,7 +96,7 @@ def _run(argv: Sequence[str] | None, parser: argparse.ArgumentParser) -> int:
         print_failure(str(error), as_json=as_json)
         return FAILED
     except ModuleNotFoundError as error:
-        if (sentence := sentence_of(error)) is None:
+        if (sentence := missing_extra_sentence(error)) is None:
             raise
         print_failure(sentence, as_json=as_json)
         return FAILED

@@ -121,7 +121,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class Commands:
-    """The commands of a parser, some of them in groups. by_name: their parsers."""
+    """The `traps` commands being declared, some of them in groups. by_name: their parsers."""
 
     def __init__(self, parser: Parser, groups: Mapping[str, str] | None = None) -> None:
         title = "groups" if groups else "commands"

@@ -1,7 +1,7 @@
 """Check what models and judges send and answer (`traps models`)."""
 
 import argparse
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
@@ -21,7 +21,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--live",
         action="store_true",
-        help="ask them: address, name, key, a clip, the schema, thinking, price; three short calls each, which cost",
+        help="ask them: address, name, key, a clip, the schema, thinking, price; four short calls at most, which cost",
     )
 
     text = "give a panel answers that try to instruct their judge; makes calls to judges"
@@ -34,7 +34,7 @@ def check(arguments: argparse.Namespace) -> int:
 
     names = _chosen_names(arguments)
     if arguments.live:
-        return _check_live([*names], {name for name, structured in names.items() if not structured}, arguments)
+        return _check_live(names, arguments)
     if arguments.json:
         checks = [*check_named([*names])]
         print_json(
@@ -56,8 +56,8 @@ def check(arguments: argparse.Namespace) -> int:
     return FAILED if n_problems else OK
 
 
-def _chosen_names(arguments: argparse.Namespace) -> dict[str, bool]:
-    """Return ids that these names stand for, and whether one may be asked for JSON. Raises TrapsError."""
+def _chosen_names(arguments: argparse.Namespace) -> dict[str, set[str] | None]:
+    """Return ids that these names stand for, with the `forms` of experiments that name them. Raises TrapsError."""
     from traps_pipeline.models.registry.judges import load_panel, load_panels
     from traps_pipeline.pipeline.experiment import load_experiment
     from traps_pipeline.storage.workspace import Workspace
@@ -65,22 +65,24 @@ def _chosen_names(arguments: argparse.Namespace) -> dict[str, bool]:
     place = place_of(arguments)
     if Workspace.is_there(place):
         enter_workspace(Workspace.open(place))
-    names, panels = dict[str, bool](), {name: [judge.id for judge in load_panel(name)] for name in load_panels()}
+    names = dict[str, set[str] | None]()
+    panels = {name: [judge.id for judge in load_panel(name)] for name in load_panels()}
     for name in arguments.names:
         if name in panels:
-            names |= dict.fromkeys(panels[name], True)
+            names |= dict.fromkeys(panels[name])
             continue
         if not name.endswith((".yaml", ".yml")):
-            names[name] = True
+            names[name] = None
             continue
         experiment = load_experiment(name)
         judges = load_panel(experiment.panel) if experiment.panel else ()
         for each in (*experiment.models, *(judge.id for judge in judges)):
-            names[each] = names.get(each, False) or experiment.is_structured
+            known = names.get(each, set())
+            names[each] = None if known is None else known | experiment.forms
     return names
 
 
-def _check_live(names: Sequence[str], unstructured: Collection[str], arguments: argparse.Namespace) -> int:
+def _check_live(names: Mapping[str, Collection[str] | None], arguments: argparse.Namespace) -> int:
     from traps_pipeline.checks.live_check import check_live
     from traps_pipeline.checks.wire_check import participants
     from traps_pipeline.models.registry.entries import NETWORK
@@ -91,7 +93,7 @@ def _check_live(names: Sequence[str], unstructured: Collection[str], arguments: 
     entries = [entry_of[name] for name in names if entry_of[name].backend == NETWORK]
     if not entries:
         raise TrapsError("--live asks over the network: name a model or judge with an address, or an experiment")
-    checks = check_live(entries, unstructured)
+    checks = check_live(entries, names)
     if arguments.json:
         print_json(checks)
     for entry_check in () if arguments.json else checks:

@@ -24,9 +24,11 @@ def add(commands: Commands) -> None:
     parser.add_argument("--all", action="store_true", help="also show the statements that agree")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
 
-    text = "write every table, figure and page to a folder, or to one file"
+    text = "write every table, figure and page to one file, or to a folder"
     parser = commands.add("results export", export_results, text, example="results.zip")
-    parser.add_argument("folder", nargs="?", type=Path, help="or a file .zip; default: `export` in the study's folder")
+    parser.add_argument(
+        "folder", nargs="?", type=Path, help="or a file .zip (default: `export.zip` in the study's folder)"
+    )
 
     text = "print this study minus another on their common pairs, with paired intervals"
     parser = commands.add("results compare", compare_studies, text, example=".workspaces/earlier", json=True)
@@ -76,7 +78,7 @@ def export_results(arguments: argparse.Namespace) -> int:
     from traps_pipeline.report.publish import INDEX, export
 
     workspace = open_workspace(arguments)
-    target = (arguments.folder or workspace.root / "export").absolute()
+    target = (arguments.folder or workspace.root / "export.zip").absolute()
     count = export(workspace, target, say=lambda line: print(line, flush=True))
     advice = f"unpack it and open {INDEX}" if target.suffix == ".zip" else f"open {target / INDEX}"
     print(f"{count_noun(count, 'file')} in {target}\nnext: {advice}")

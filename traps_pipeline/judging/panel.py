@@ -254,7 +254,7 @@ class AnswerSlice(Cell):
 
     @property
     def whole(self) -> Cell:
-        """The cell of this slice."""
+        """The cell of answers that this slice is a part of."""
         return Cell(self.dataset, self.evaluation)
 
 
@@ -292,7 +292,7 @@ def ask_judges(
     calls: Callable[[AnyCell], Sequence[AnyCall]],
     finish: Callable[[SettledCell[AnyCell, AnyCall]], Finished],
 ) -> Iterator[Finished]:
-    """Call `collect_outcomes` for judges, with the ledger of votes."""
+    """Ask judges for missing votes, recorded in the ledger of votes."""
     return collect_outcomes(workspace, stage, workspace.votes, judges, cells, calls, finish, _make_judge)
 
 

@@ -101,7 +101,7 @@ class Attacks(BaseModel):
 
 
 def load_attacks(path: Path = ATTACKS_FILE) -> Attacks:
-    """Return the attacks. Raises TrapsError naming file and field."""
+    """Return the answers that try to instruct a judge. Raises TrapsError naming file and field."""
     return parse_yaml_model(Attacks, read_yaml(path), path)
 
 

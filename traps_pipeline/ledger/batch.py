@@ -112,7 +112,7 @@ class Batch:
         return frozenset(each.session for each in self.amounts()) - {self.session, ""}
 
     def flush(self) -> None:
-        """Write the collected changes, and seal what they leave."""
+        """Write the collected rows and money, and renew the ledger's seal."""
         self._execute(_ADD_ROW, *self.rows)
         self._execute(_REMOVE, *({"of_study": self.study, "of_id": reservation} for reservation in self._gone))
         settled = ({"of_study": self.study, "of_id": each, "new_usd": usd} for each, usd in self._settled.items())
@@ -159,7 +159,7 @@ class Batch:
         return True
 
     def reseal(self) -> None:
-        """Seal what is there; totals below the costs of the whole rows are raised to them."""
+        """Seal the ledger's present rows; raise totals that are below the rows' costs."""
         totals = self.connection.execute(sa.select(TOTALS).where(TOTALS.c.study == self.study))
         stored, sums = (
             {(row.kind, row.participant): row for row in totals},

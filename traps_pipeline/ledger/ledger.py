@@ -233,7 +233,7 @@ class Writer:
     def __init__(self, database: Database, kind: str, evaluation: tuple[int, str], lock: Lock) -> None:
         self._database, self._kind, self._lock = database, kind, lock
         self._evaluation, self._bound = evaluation[0], f"{kind}/{evaluation[1]}"
-        self._is_synced = True
+        self._is_synced, self._syncing = True, asyncio.Lock()
 
     async def require(self) -> None:
         """Raise TrapsError if this writer has lost the evaluation, before a call is sent."""
@@ -276,6 +276,7 @@ class Writer:
 
     async def sync(self) -> None:
         """Sync the written rows to disk. Raises TrapsError."""
-        if not self._is_synced:
-            self._is_synced = True
-            await asyncio.to_thread(self._database.sync)
+        async with self._syncing:  # rows of another cell may be on their way to the disk
+            if not self._is_synced:
+                self._is_synced = True
+                await asyncio.to_thread(self._database.sync)

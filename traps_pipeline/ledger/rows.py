@@ -113,7 +113,7 @@ def digest_of(
 
 
 def is_whole(row: Any, evaluation: str) -> bool:
-    """Return whether a row of the table is what was written into an evaluation, KIND/NAME."""
+    """Return whether a ledger row is unaltered, by its digest. KIND/NAME names its evaluation."""
     try:
         bound = evaluation if len(row.digest) == 17 else None
         return digest_of(row.key, row.content, row.reasoning, row.raw, bound) == row.digest
@@ -174,7 +174,7 @@ class Totals:
                 self._add_to_mean(column, row[column], 1)
 
     def join(self, other: Totals) -> None:
-        """Add another total of the same participant."""
+        """Add the counts and costs of another total of the same participant."""
         self.dollars, self.dearest = self.dollars + other.dollars, max(self.dearest, other.dearest)
         self.failed, self.unknown = self.failed + other.failed, self.unknown + other.unknown
         for column, (total, count) in other.means.items():

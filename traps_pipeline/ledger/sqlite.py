@@ -184,7 +184,7 @@ class SqliteDatabase(Database):
 
     @override
     def beat(self) -> None:
-        """Note what is booked beside the file; the kernel keeps the locks."""
+        """Save the money that is booked in a note beside the ledger's file."""
         if self.booked != self.noted and self.path.name == FILE:
             write_text(self.path.with_name(NOTE), json.dumps(self.booked))
             self.noted = self.booked

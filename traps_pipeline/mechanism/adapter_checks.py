@@ -56,7 +56,7 @@ class Subject:
 
     @property
     def layer(self) -> int:
-        """A layer in the middle."""
+        """The layer in the middle of the model, on which adapters are tried."""
         return max(1, self.model.n_layers // 2)
 
     def steered(self, *alphas: float) -> Steering:

@@ -59,7 +59,7 @@ def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return `regime_matrix` of guided directions and inference by source `family`."""
+    """Return effects of guided directions by the taxonomy of the data that they came from."""
     guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
     return _regime_rows(guided, taxonomy_of)
 

@@ -207,7 +207,7 @@ class Outcomes:
         )
 
 
-def separation(decisions: Decisions, void: np.ndarray) -> float:
+def gate_auroc(decisions: Decisions, void: np.ndarray) -> float:
     """Return AUROC of a gate's scores against labels void (n,); NaN with one side."""
     is_known = np.isfinite(decisions.score)
     return float(auroc(void[is_known], decisions.score[is_known]))

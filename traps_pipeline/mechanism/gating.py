@@ -22,7 +22,7 @@ from traps_pipeline.mechanism.gate import (
     Outcomes,
     families,
     gate_answers,
-    separation,
+    gate_auroc,
     sources_of_gate,
 )
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
@@ -88,7 +88,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return all items as `gate.GateItems.table`, in the order of `states.items`."""
+    """Return the table of items that the abstention gate reads, in the order of their hidden states."""
     items = states.items
     id_columns = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     table = id_columns.assign(family=families(items), prompt=items["states_key"])
@@ -96,7 +96,7 @@ def gate_table(states: StoredStates) -> pd.DataFrame:
 
 
 def chosen_layers(workspace: Workspace, states: StoredStates, targets: Iterable[str]) -> dict[str, int]:
-    """Return the layer of each target's gates, by `layer_choice` without its labels."""
+    """Return the layer at which each target's gate reads hidden states, chosen without its labels."""
     rows = workspace.tables.read(PROBES, states.extraction.partition).to_dict("records")
     curves = pair_curves({str(name): value for name, value in row.items()} for row in rows)
     return {target: layer_choice(curves, target).layer for target in targets}
@@ -209,7 +209,7 @@ def _rows(
                 about_pecs = interval(metrics_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
                 dataset_metrics.append(values)
                 draws.append(metrics_of(sums, in_mean=True)[:, _PECS, 1:])
-            area = separation(decisions, outcome.void)
+            area = gate_auroc(decisions, outcome.void)
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))
         if len(dataset_metrics) == len(DATASETS):

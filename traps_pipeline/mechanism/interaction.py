@@ -86,7 +86,7 @@ def _chosen_layer(workspace: Workspace, states: StoredStates) -> int | None:
 def figures_of(
     features: np.ndarray, design: LaneDesign, folds: int, resamples: int, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the figures of features (n, d) by what is held out, of HELD_OUT what has at least two groups."""
+    """Return probe metrics of features (n, d), by what is held out of training."""
     one_hidden, result = design.asked != design.other, dict[str, dict[str, Any]]()
     of_one = design.scenarios[one_hidden]
     weights = scenario_weights(design.scenarios.max() + 1, resamples, seed)

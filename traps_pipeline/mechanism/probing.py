@@ -170,7 +170,7 @@ class ProbeRun:
         return [self._score_row("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the same pairs restricted to confabulated voids and their controls."""
+        """Return the transfer's pairs whose void the model confabulated on, with their controls."""
         confabulated_splits = self._confabulated_splits(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(confabulated_splits)]
         scores = transfer_scores(confabulated_splits, pairs, self.fit)
@@ -358,7 +358,7 @@ def _row(
 
 
 def mark_layers(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with flags on the layers that tables show.
+    """Mark, in rows of probes, the layers that the report's tables show.
 
     own_best: the maximum of the row's own curve (the paper's choice, which uses target labels); all_sample_best: the
     maximum of the pair's all-sample transfer curve; chosen: the layer of the target without its labels

@@ -46,7 +46,7 @@ BY_LABEL = "label"  # the paper's sign policy, which knows the side of each item
 
 @dataclass(frozen=True)
 class Strength:
-    """One direction at one strength.
+    """A void direction and the strength at which it is added to hidden states.
 
     alpha has no sign: `signs` says on which side alpha times the direction is added and on which it is subtracted.
     dose: in its unit, one of DoseUnit.

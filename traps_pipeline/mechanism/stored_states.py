@@ -63,7 +63,7 @@ class StoredStates:
         return self.items.loc[self.items["dataset"] == name]
 
     def read_as(self, order: StoredStates, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
-        """Return states as `read`, in the order of another extraction's items."""
+        """Read hidden states in the order of another extraction's items."""
         places = pd.Index(self.dataset(dataset)["item_id"]).get_indexer(pd.Index(order.dataset(dataset)["item_id"]))
         if (places < 0).any():
             raise TrapsError(

@@ -112,7 +112,7 @@ def _stages(costs: bool) -> list[Stage]:
 _GONE = "its file is gone; materialize it again: nothing that the ledger holds is asked"
 
 
-def report_unseen(instance: dg.DagsterInstance, plan: RunPlan, reported: dict[str, str]) -> None:
+def report_outdated(instance: dg.DagsterInstance, plan: RunPlan, reported: dict[str, str]) -> None:
     """Fail the check `current` for altered, lost or stale partitions, and pass it once they are well.
 
     reported: the failures that were reported and last, by partition; at most MAX_REPORTS change at once.
@@ -192,7 +192,7 @@ def _sensor(name: str, doc: str, *, costs: bool) -> dg.SensorDefinition:
         if context.instance.get_runs_count(dg.RunsFilter(statuses=UNFINISHED)):
             return dg.SkipReason("runs are under way")  # they may be mending what would be reported
         reported: dict[str, str] = json.loads(context.cursor or "{}")
-        report_unseen(context.instance, plan, reported)
+        report_outdated(context.instance, plan, reported)
         context.update_cursor(json.dumps(reported))
         plan = plan.part(stage.name for stage in _stages(costs))
         return _requests(context.instance, plan) or dg.SkipReason(_nothing_to_request(reported))

@@ -108,9 +108,10 @@ class Experiment(Settings):
         return Study(**{name: value for name, value in values.items() if value is not None})
 
     @property
-    def is_structured(self) -> bool:
-        """Whether a model is asked for an object of a schema, in any of its calls."""
-        return self.canary or any(fields_of(r, d) for r in self.regimes for d in self.datasets)
+    def forms(self) -> set[str]:
+        """The regimes that stand for what calls ask for beside plain text: an object of a schema, log-probabilities."""
+        is_structured = self.canary or any(fields_of(r, d) for r in self.regimes for d in self.datasets)
+        return {r for r in self.regimes if BY_NAME[r].first_token} | ({"json"} if is_structured else set())
 
     @property
     def asked(self) -> Asked:
@@ -187,7 +188,7 @@ def load_experiment(name: str) -> Experiment:
             )
         if physical := [
             *(model for model in experiment.models if get_model(model).backend in ("observer", "rule")),
-            *(dataset for dataset in experiment.datasets if dataset in UNPAIRED),
+            *(dataset for dataset in experiment.datasets if dataset in UNPAIRED and dataset != TWO_EVENTS),
         ]:
             refuse_recorded(", ".join(physical))
         for model in experiment.mechanism.models if experiment.mechanism else ():

@@ -88,7 +88,7 @@ def _preflight(
     models = [entry for entry in network if entry not in judges]
     from traps_pipeline.checks.live_check import preflight, require_sound
 
-    checks = preflight(workspace, models, judges, structured=experiment.is_structured)
+    checks = preflight(workspace, models, judges, experiment.forms)
     for check in checks:
         if not check.problems:  # they are raised instead
             say(check.line)

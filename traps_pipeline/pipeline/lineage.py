@@ -224,7 +224,7 @@ def _differences(then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[st
 
 
 def write_report_state(workspace: Workspace, stage: Stage, state: State) -> None:
-    """Write the lineage of a stage's files for people, in a folder beside them."""
+    """Record which inputs a stage's report files were made from, in a folder beside them."""
     workspace.store.write({_report_state(workspace, stage): json.dumps(asdict(state)).encode()})
 
 

@@ -47,7 +47,7 @@ def nothing_to_do_reason(keys: Sequence[str | None], tags: Mapping[str, str], wo
 
 
 def require_machine(plan: RunPlan, parts: Parts | None = None) -> None:
-    """Raise TrapsError unless the machine can build what is still missing of a plan, or of a part of it.
+    """Raise TrapsError unless this machine can build what a plan, or a part of it, still needs.
 
     Disk, OpenGL, codecs, proxies and certificates are checked as far as these partitions need them; the error names the
     first that is missing or that a variable breaks. A study whose clips exist needs no OpenGL, and one whose answers

@@ -36,7 +36,7 @@ def page_text(text: str) -> str:
 
 @contextmanager
 def errors_for_pages() -> Iterator[None]:
-    """Let errors of the block, and what caused them, say what they say by `page_text`."""
+    """Escape, for Dagster's pages, the messages of errors raised in the block and of their causes."""
     try:
         yield
     except Exception as error:
@@ -70,13 +70,13 @@ def visible_metadata(value: Any) -> Any:
 
 
 def tally_metadata(stage: Stage, tally: Tally) -> dict[str, int]:
-    """Return a run's work on a partition as numbers for Dagster's plots, without zeros of what never happens."""
+    """Return the calls of a partition (asked, cached, failed) as numbers for Dagster's plots."""
     paid_counts = {"asked", "cached", "errors"} if stage.cost else set()
     return {WORDS[name]: count for name, count in vars(tally).items() if count or name in paid_counts}
 
 
 def tally_of(metadata: Mapping[str, dg.MetadataValue]) -> Tally:
-    """Return the work that `tally_metadata` has written."""
+    """Read a partition's counts of calls back from Dagster's metadata."""
     return Tally(**{name: cast(int, metadata[word].value) for name, word in WORDS.items() if word in metadata})
 
 

@@ -18,7 +18,7 @@ SEPARATOR = "|"  # between the two dimensions of a key, as Dagster writes it
 
 @dataclass(frozen=True, eq=False)
 class Partitioning:
-    """A partitioning scheme.
+    """A way to divide an asset into partitions: the names of its dimensions and their keys.
 
     dimensions: the keys of each dimension by its name, one or two, sorted by name. columns: returns the values of a
     table's partition columns for a key; wanted: returns a study's keys.
@@ -63,7 +63,7 @@ class KeyMapping(Protocol):
 
 @dataclass(frozen=True)
 class Every(KeyMapping):
-    """All partitions of the parent."""
+    """A dependency on all partitions of the upstream asset."""
 
     @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:

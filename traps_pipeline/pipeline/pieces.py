@@ -21,7 +21,7 @@ NOTES = "inputs.json"  # archive member with the digests of each piece
 
 @dataclass(frozen=True)
 class Piece:
-    """One part of an asset.
+    """A part of an asset that one process builds while others build the rest.
 
     reads: the stages and sources whose versions decide whether it is rebuilt.
     inputs: returns what it shows of them, as JSON; if their versions have changed, it is rebuilt only if this has, too.

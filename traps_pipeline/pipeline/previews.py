@@ -26,7 +26,7 @@ class Markdown:
 
 @dataclass(frozen=True)
 class Records:
-    """Rows of a small table."""
+    """A small table that Dagster's pages show with a partition."""
 
     rows: Sequence[Mapping[str, Any]]
 

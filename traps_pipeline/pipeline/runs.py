@@ -20,15 +20,16 @@ from typing_extensions import override
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.money.budget import BudgetReached
 from traps_pipeline.pipeline.graph import Stage
+from traps_pipeline.pipeline.history_files import HistoryUnwritable
 from traps_pipeline.pipeline.ranges import Range, key_ranges
 from traps_pipeline.pipeline.translation import asset_key
 
 PID_TAG, HOST_TAG = "traps/pid", "traps/host"
-JOB_TAG = "traps/job"
-PARENT_TAG, ROOT_TAG = "dagster/parent_run_id", "dagster/root_run_id"
+# Tags of the runs that a job starts; the job's own run has the second one, too, so that the pages list them together.
+# With Dagster's tag of a parent, its pages would call them re-executions.
+JOB_TAG, JOB_RUN_TAG = "traps/job", "traps/job_run"
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
-# Errors whose message is for people; the last one's class is imported only if SQLite holds the history.
-_SENTENCES = (TrapsError.__name__, BudgetReached.__name__, "HistoryUnwritable")
+_SENTENCES = (TrapsError.__name__, BudgetReached.__name__, HistoryUnwritable.__name__)  # messages for people
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
 _LOOK_S = 1.0  # between two looks whether a run was terminated in Dagster's pages
 _stopped_here = set[str]()  # runs that a signal to this process stops already
@@ -67,9 +68,10 @@ class LocalRuns(Runs):
         log: Callable[[str], None] = lambda line: None,
     ) -> None:
         self._instance, self._job, self._parent, self._log = instance, job, parent, log
-        ids = {PARENT_TAG: parent.run_id, ROOT_TAG: parent.root_run_id or parent.run_id} if parent else {}
-        ids |= {JOB_TAG: parent.job_name} if parent else {}  # Dagster's pages call a run with a parent a re-execution
-        self._tags = {PID_TAG: str(os.getpid()), HOST_TAG: this_host(), **ids}
+        self._tags = {PID_TAG: str(os.getpid()), HOST_TAG: this_host()}
+        if parent:
+            instance.add_run_tags(parent.run_id, {JOB_RUN_TAG: parent.run_id})
+            self._tags |= {JOB_TAG: parent.job_name, JOB_RUN_TAG: parent.run_id}
         self.finished: list[dict[str, str]] = []
 
     def ranges(self, stages: Sequence[Stage], keys: Sequence[str | None]) -> Sequence[Range]:

@@ -26,7 +26,7 @@ VOTE_COLUMNS = [*ANSWER, "side", "task", "judge", "valid", "abstained", "correct
 
 @dataclass(frozen=True)
 class Ratings:
-    """The matrix of votes.
+    """Judges' votes as a matrix: a row for each answer, a column for each judge.
 
     answers: one row per answer and task, with the columns `answer` (which identify an answer), task (one of TASKS),
     epoch and benchmark_version. values: (rows, judges) int8 of YES, NO and INVALID, columns in the order of `judges`.
@@ -58,7 +58,7 @@ class Ratings:
 
 
 def ratings(votes: pd.DataFrame, judges: Sequence[str] | None = None, answer: Sequence[str] = ANSWER) -> Ratings:
-    """Return the matrix of VOTES rows (with `VOTE_COLUMNS` at least) of these judges.
+    """Return judges' votes as a matrix, from VOTES rows (with `VOTE_COLUMNS` at least).
 
     judges: default all, in alphabetical order. Rows of another table of votes work too, if the columns `answer`
     identify an answer. An answer without a vote of each of these judges is left out: another panel judged it.

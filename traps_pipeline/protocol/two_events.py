@@ -43,7 +43,7 @@ class LaneItem:
 
     @property
     def item_id(self) -> str:
-        """Its id."""
+        """The item's id, `two_events:SCENARIO:LANE.CLIP`."""
         return f"{TWO_EVENTS}:{self.scenario_id}:{self.name}"
 
     @property

@@ -40,7 +40,7 @@ class _Strict(BaseModel):
 
 
 class Commitment(_Strict):
-    """The public file.
+    """The public file that commits to held-out scenarios before they are released.
 
     draws: scenarios by family. look: the varied parts of the look, by family. difficulty: settings of every scene.
     seed: digest of the seed. specs: digest of each record. made_with: machine and libraries, which may affect the
@@ -115,12 +115,12 @@ def _arithmetic() -> dict[str, str]:
 
 
 def read_commitment(path: Path) -> Commitment:
-    """Read a commitment. Raises TrapsError."""
+    """Read the public file that commits to held-out scenarios. Raises TrapsError."""
     return _read(Commitment, path)
 
 
 def read_reveal(path: Path) -> Reveal:
-    """Read a reveal. Raises TrapsError."""
+    """Read the file that reveals held-out scenarios of a commitment. Raises TrapsError."""
     return _read(Reveal, path)
 
 

@@ -58,7 +58,7 @@ PLACES: Mapping[str, str] = {table.name: f"{table.name}.jsonl" for table in OPEN
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a release.
+    """Options of `traps publish release`: what a release holds.
 
     arms: published beside the pairs. held_out: the file of the key that gives items opaque names, beside which their
     answers are written; None to publish the answers. date: date of publication, YYYY-MM-DD. commitment: a file of

@@ -73,7 +73,7 @@ class RankedGroup:
 
 @dataclass
 class Board:
-    """All submissions of a page."""
+    """The submissions that a leaderboard page ranks."""
 
     groups: list[RankedGroup] = field(default_factory=list)
     accepted: list[AcceptedSubmission] = field(default_factory=list)

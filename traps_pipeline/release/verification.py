@@ -62,7 +62,7 @@ Row = Mapping[str, Any]
 
 @dataclass
 class Verification:
-    """The result of a verification.
+    """The checks of a submission or release, with their problems.
 
     problems: one sentence each; checked and unchecked: what was verified, and what could not be. verdicts and scored:
     recomputed from the votes, None if that is impossible.
@@ -75,7 +75,7 @@ class Verification:
     scored: Scores | None = None
 
     def record_check(self, topic: str, complaints: Iterator[str]) -> None:
-        """Record a check and its problems: keep the first ones and count the others."""
+        """Record a check of a submission and its problems; count those beyond the first few."""
         problems = list(complaints)
         self.checked.append(topic)
         self.problems += problems[:MAX_SENTENCES]

@@ -56,12 +56,12 @@ class Card:
 
     @classmethod
     def read(cls, data: bytes) -> Card:
-        """Return the card that `data` serialized."""
+        """Read a report card from its JSON."""
         return cls(**json.loads(data))
 
     @property
     def data(self) -> bytes:
-        """The card as JSON, from which `read` makes it again."""
+        """The report card as JSON."""
         return json.dumps(asdict(self)).encode()
 
 
@@ -89,7 +89,7 @@ def explorer_address(behind: SourceItems) -> str:
 
 
 def table_card(report: TableReport, sources: Sources, address: LinkOf | None = explorer_address) -> Card:
-    """Return the card of a study's tables."""
+    """Return a report card that holds one or more tables of a study."""
     name = _name(report)
     try:
         tables = report.tables(sources.study)
@@ -121,7 +121,7 @@ def paper_card(report: TableReport | FigureReport, sources: Sources) -> Card:
 
 
 def tables_html(tables: Sequence[PrintedTable], title: str, address: LinkOf | None) -> list[Mapping[str, object]]:
-    """Return each table's title (empty if the card's), fragment and downloads by name."""
+    """Return the HTML of a card's tables, each with its title and downloads by name."""
     return [
         {
             "title": table.title if table.title != title else "",
@@ -160,13 +160,13 @@ def _failure(what: str, sources: Sources, error: Exception) -> str:
     return reason
 
 
-def picture_card(picture: Picture) -> Card:
-    """Return the card of a picture of clips."""
+def picture_card(picture: Picture, shows: str) -> Card:
+    """Return the card of a picture of clips, and what it says below."""
     try:
         pictures = {"": _picture(picture.name, picture.figure(), "webp")}
     except NotRun as reason:
         return Card(picture.name, picture.title, why=str(reason))
-    return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title))
+    return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title), shows=shows)
 
 
 def _name(report: TableReport | FigureReport) -> str:

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.registry.judges import BY_RULES
+from traps_pipeline.people.recorded_certificates import UNCERTIFIED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,7 +57,7 @@ class TableReport:
 
     @property
     def make(self) -> Callable[[Results], list[PrintedTable]]:
-        """The function that makes it."""
+        """The function that makes the table from results."""
         return _function(f"tables.{self.function}")
 
     @property
@@ -66,7 +67,7 @@ class TableReport:
 
     @property
     def published(self) -> bool:
-        """Whether the paper has such a table."""
+        """Whether the paper prints a table of this name."""
         return self.paper or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
@@ -107,7 +108,7 @@ class TableReport:
 
 @dataclass(frozen=True)
 class FigureReport:
-    """A figure.
+    """A figure of the report: its name, title and the function that draws it.
 
     reads: the stages whose tables it uses; published: whether the paper prints its numbers.
     frames: the frames of `Results` that it draws, if it is to be drawn again only when these change.
@@ -123,7 +124,7 @@ class FigureReport:
 
     @property
     def make(self) -> Callable[[Results], Figure]:
-        """The function that draws it."""
+        """The function that draws the figure from results."""
         return _function(f"figures.{self.function}")
 
     @property
@@ -140,9 +141,10 @@ class FigureReport:
         return f"{self.finding(results)} {self.doc}".strip()
 
     def inputs(self, results: Results) -> list[str]:
-        """Return the frames that it draws, with refusals and judges, as text."""
+        """Return the frames that it draws, with refusals, judges and certificates, as text."""
         frames: list[pd.DataFrame] = [getattr(results, name) for name in self.frames]
-        return [repr(rows.to_dict("split")) for rows in frames] + [repr(results.refused), results.judged_by]
+        said = [repr(results.refused), results.judged_by, results.certified]
+        return [repr(rows.to_dict("split")) for rows in frames] + said
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Return PDF, SVG and PNG by path; empty if the figure was not run."""
@@ -155,10 +157,12 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """Return the figure, with a note if rules judged. Raises NotRun without data."""
+        """Return the figure, with a note if rules judged, or people certify no pairs. Raises NotRun without data."""
         figure = self.make(results)
-        if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
-            _say_below(figure, BY_RULES)
+        is_by_rules = BY_RULES in results.judged_by.lower() and _is_judged(self.reads)
+        said = [BY_RULES] * is_by_rules + [UNCERTIFIED] * results.certified.startswith(UNCERTIFIED)
+        if said:
+            _say_below(figure, "\n".join(said))
         return figure
 
 
@@ -259,7 +263,7 @@ def folder(kind: str, results: Results) -> str:
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at a figure's foot, or along its right edge if there is no room."""
+    """Write lines at a figure's foot, or along its right edge if there is no room."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     from traps_pipeline.report.writing import SOFT, figure_style
@@ -271,7 +275,8 @@ def _say_below(figure: Figure, text: str) -> None:
             figure.supxlabel(text, x=0.99, ha="right", **look)
             return
         if isinstance(engine, ConstrainedLayoutEngine):
-            engine.set(rect=(0, 0, 1 - RIGHT_EDGE_IN / figure.get_figwidth(), 1))
+            edge_in = RIGHT_EDGE_IN * (1 + text.count("\n"))
+            engine.set(rect=(0, 0, 1 - edge_in / figure.get_figwidth(), 1))
         figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
 
 

@@ -48,5 +48,5 @@ def latex(text: object) -> str:
 
 
 def latex_of_plain(cell: str) -> str:
-    """Return `latex` of a text that is plain already."""
+    """Escape printable text for LaTeX; hidden characters were escaped before."""
     return cell.translate(_LATEX)

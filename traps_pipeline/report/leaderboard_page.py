@@ -96,7 +96,7 @@ def leaderboard_text(board: pd.DataFrame, two_way: pd.DataFrame | None = None, n
 def leaderboard_tables(
     board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = ()
 ) -> list[TextTable]:
-    """Return what `leaderboard_text` says, a table per panel, the first below what is missing."""
+    """Return the leaderboard as text: one table per panel, headed by what is missing."""
     first, *others = (table_text(table) for table in leaderboards(board, two_way, notes, brief=True))
     lacking = shortfall(board)
     return [replace(first, title=f"{lacking}\n{first.title}") if lacking else first, *others]

@@ -14,7 +14,7 @@ NO_BOARD = "no leaderboard: neither pairs nor two events were asked; the report 
 
 
 def board_bytes(tables: Sequence[TextTable]) -> bytes:
-    """Return the content of BOARD_FILE."""
+    """Return a study's leaderboard tables as JSON, from which the terminal prints them."""
     return json.dumps([asdict(table) for table in tables], ensure_ascii=False).encode()
 
 

@@ -81,7 +81,7 @@ def titled_rows(file: str) -> pd.DataFrame:
 
 
 def figures(names: Mapping[str, str]) -> list[Column]:
-    """Return columns of figures (field: heading), shown as the paper prints them."""
+    """Return table columns of metrics (field: heading), formatted as in the paper."""
     return [Column(field, heading, "range") for field, heading in names.items()]
 
 

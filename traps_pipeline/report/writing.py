@@ -112,7 +112,7 @@ class Column:
         return self.unit != "text"
 
     def text(self, row: Mapping[str, Any]) -> str:
-        """Return the cell as printed; a dash where there is no number."""
+        """Return a table's cell as text; a dash where there is no number."""
         return _joined(self.parts(row))
 
     def parts(self, row: Mapping[str, Any], plain: Callable[[object], str] = plain) -> tuple[str, str, str]:
@@ -223,7 +223,7 @@ class PrintedTable:
 
 
 def table_files(table: PrintedTable) -> dict[str, bytes]:
-    """Return the table as `name.csv` (fractions), `.tex` and `.md`."""
+    """Return a table's files: `name.csv` (fractions), `.tex` and `.md`."""
     return {
         f"{table.name}.csv": csv_bytes(table.data),
         f"{table.name}.tex": table_latex(table).encode(),

@@ -50,7 +50,7 @@ def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
 
 
 def null_single_deviations(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows, with deviations set to null where there was only one run."""
+    """Set standard deviations to null in rows that rest on a single run."""
     spreads = [name for name in rows if name.endswith("_std")]
     return rows.assign(**{name: rows[name].where(rows["n_runs"] > 1) for name in spreads})
 

@@ -155,7 +155,7 @@ class Resampling:
     seed: int
 
     def unseen(self, named: str, decisions: int) -> np.ndarray:
-        """Return an unseen scenario's weights, (decisions, 1 + resamples) float64.
+        """Return the bootstrap weights of a scenario met for the first time, (decisions, 1 + resamples) float64.
 
         They are the same for the same name, and independent for two names.
         """

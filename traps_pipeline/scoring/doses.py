@@ -50,7 +50,7 @@ _ITEM_COLUMNS = [
 
 @dataclass(frozen=True)
 class Dose:
-    """A step of a hypothesis.
+    """One dose of a hypothesis: a setting of a scene whose effect is measured.
 
     datasets: where it is asked. side: None for both. counts_as: the sides that its items count as.
     """

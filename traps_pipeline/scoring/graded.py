@@ -34,7 +34,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class GradedItem:
-    """A graded item.
+    """An item whose clip is cut early, with the probability of each answer at the cut.
 
     posterior: the probability of each possible answer.
 

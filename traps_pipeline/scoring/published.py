@@ -40,7 +40,7 @@ def published_digest() -> str:
 
 
 def published_cells() -> pd.DataFrame:
-    """Return the per-dataset table as cells for `analyses`, shares as fractions.
+    """Return the paper's table per dataset as rows of a study's cells, shares as fractions.
 
     Columns model, dataset, regime, epoch, n_pairs, acc, abs_rec, false_abs, pecs, and their `_std` over runs (null for
     the single greedy run of qwen3-vl-8b). A cell has one epoch: `corrected`; on chaotic_ill_posed it is `original`, or

@@ -24,7 +24,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class CorrectionEffect:
-    """The effect of corrections.
+    """What a correction of the benchmark changes: scenarios, items, and calls to repeat.
 
     Items by id, the maximum number of answers and votes to ask again (the ledger may know some), dollars of calls over
     the network (None if a price is unknown), scenarios to render again, removed and new scenarios, and the corrected
@@ -41,7 +41,7 @@ class CorrectionEffect:
     question: str = ""
 
     def plus(self, other: CorrectionEffect) -> CorrectionEffect:
-        """Return the sum of both."""
+        """Return the summed counts of two corrections."""
         is_priced = self.dollars is not None and other.dollars is not None
         return CorrectionEffect(
             self.items + other.items, self.answers + other.answers, self.votes + other.votes,
@@ -50,7 +50,7 @@ class CorrectionEffect:
         )  # fmt: skip
 
     def sentence(self) -> str:
-        """Return the counts in words."""
+        """Return a sentence with the numbers of items and calls that a correction repeats."""
         money = "an unknown price" if self.dollars is None else f"about {self.dollars:.2f} USD"
         calls = f"at most {count_noun(self.answers, 'answer')} and {count_noun(self.votes, 'vote')}"
         cost_text = f"{count_noun(len(self.items), 'item')} to ask or judge again: {calls}, {money}"

@@ -34,7 +34,7 @@ Record = Mapping[str, Any]
 
 
 class Decision(BaseModel):
-    """A reviewer's decision.
+    """A reviewer's decision about a scenario, as the page sends it.
 
     seen: the number of decisions about the scenario on the page. `add` creates a new scenario of the same family, with
     this one's parameters and the changes.
@@ -87,7 +87,7 @@ class Review:
 
     @cached_property
     def flags(self) -> Any:
-        """`queue.flags` of the study at the start of the review."""
+        """Judges' and models' disagreement by scenario, as of the review's start."""
         return flags(self.workspace)
 
     @cached_property
@@ -110,7 +110,7 @@ class Review:
         return frozenset(id_ for id_, correction in last.items() if is_reviewed([correction]))
 
     def queue(self, name: QueueName) -> list[str]:
-        """Return the scenarios of a queue (`queue.queue`)."""
+        """Return the scenarios that a queue of the review pages offers, in order."""
         return queue(name, list(self.specs), self.reviewed(), self.flags)
 
     def decide(self, sent: Decision) -> None:

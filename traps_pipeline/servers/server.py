@@ -31,11 +31,11 @@ class NotFound(TrapsError):
 
 
 class Refused(TrapsError):
-    """The request is invalid (400)."""
+    """A page's request that cannot be read (HTTP 400)."""
 
 
 class Conflict(TrapsError):
-    """Another person was faster (409)."""
+    """A page's request that another person's decision has overtaken (HTTP 409)."""
 
 
 def new_app() -> FastAPI:

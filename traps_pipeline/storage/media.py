@@ -125,7 +125,7 @@ def pick(times: np.ndarray, spec: MediaSpec) -> np.ndarray:
 
 
 def pick_frames(clip: Path, spec: MediaSpec) -> Frames:
-    """Return a clip's frames as a model sees them; may raise DamagedClip.
+    """Return the frames of a clip that a model is sent; may raise DamagedClip.
 
     Those of profile frames are cached until the file changes, and shared by callers, who must not change them; the
     files of other profiles are prepared once.

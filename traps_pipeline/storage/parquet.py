@@ -197,7 +197,7 @@ class TableStore:
         return self.arrow(table, partition, columns).to_pandas()
 
     def arrow(self, table: Table, partition: Mapping[str, Any], columns: Sequence[str] | None = None) -> pa.Table:
-        """Return `read` as an Arrow table."""
+        """Read one partition as an Arrow table."""
         return self._load(table, self.path(table, partition), columns)
 
     def records(
@@ -212,7 +212,7 @@ class TableStore:
         return self.read_arrow(table, columns, **equal).to_pandas()
 
     def read_arrow(self, table: Table, columns: Sequence[str] | None = None, **equal: Any) -> pa.Table:
-        """Return `read_all` as an Arrow table."""
+        """Read all partitions with given column values as one Arrow table."""
         import pyarrow as pa
 
         unknown_columns = sorted(set(equal) - set(table.partition_by))

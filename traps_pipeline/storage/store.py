@@ -42,7 +42,7 @@ class UnusedObject:
 
 
 class Store(ABC):
-    """The files of one study.
+    """Where a study's files lie: a folder, or a place in an object store.
 
     root: the local folder below which every path lies. leases: who keeps them; by default, locks on files below it.
     """
@@ -59,7 +59,7 @@ class Store(ABC):
 
     @abstractmethod
     def bring(self, paths: Iterable[Path]) -> None:
-        """Fetch these files, if they exist, to their local paths. Raises TrapsError."""
+        """Fetch files of the study, if they exist, to their local paths. Raises TrapsError."""
 
     @abstractmethod
     def keep(self, paths: Iterable[Path]) -> None:
@@ -67,14 +67,14 @@ class Store(ABC):
 
     @abstractmethod
     def write(self, files: Mapping[Path, bytes], *, note: str | None = None, durable: bool = False) -> None:
-        """Write these contents, all or none if several hosts see them.
+        """Write files of the study; where several hosts see them, all or none.
 
         note: returned by `note` later. durable: not even a power cut leaves a torn file. Raises TrapsError.
         """
 
     @abstractmethod
     def remove(self, paths: Iterable[Path]) -> None:
-        """Remove the files of these paths."""
+        """Remove files of the study, if they exist."""
 
     def has(self, path: Path) -> bool:
         """Return whether a path has a file."""
@@ -86,7 +86,7 @@ class Store(ABC):
 
     @abstractmethod
     def there(self, paths: Iterable[Path]) -> set[Path]:
-        """Return those of these paths that have a file, without looking at any content."""
+        """Return which paths exist as files, without reading them."""
 
     @abstractmethod
     def digests(self, paths: Iterable[Path]) -> dict[Path, str]:

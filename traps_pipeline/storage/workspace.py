@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 VARIABLE = "TRAPS_WORKSPACE"
 RAY = "TRAPS_RAY"  # environment variable: the address of Ray's head, http://HEAD:8265
 RUN_CPUS, RUN_GPUS = "TRAPS_RUN_CPUS", "TRAPS_RUN_GPUS"  # for cluster runs that Dagster's pages launch
+_GONE_STORAGE = "traps_pipeline.pipeline.event_storage"
 DATABASE = "TRAPS_DATABASE"  # default variable for the database's address of a new study in a store
 
 
@@ -153,10 +154,11 @@ class Workspace:
     def copy_dagster_yaml(self, home: Path | None = None) -> None:
         """Copy `assets/dagster.yaml` to Dagster's folder (default: the workspace's) if it has none.
 
-        A study's own `dagster.yaml` may name another storage.
+        A study's own `dagster.yaml` may name another storage. That of version 0.3.0 names a class that is no more;
+        Dagster's own storage reads its files.
         """
         own = (home or self.dagster_home) / "dagster.yaml"
-        if own.is_symlink() or not own.exists():
+        if own.is_symlink() or not own.exists() or _GONE_STORAGE in own.read_text(encoding="utf-8"):
             write_text(own, (ASSETS / "dagster.yaml").read_text(encoding="utf-8"))
 
     @property

@@ -80,7 +80,7 @@ def prepare_media(workspace: Workspace, cells: Sequence[Cell]) -> None:
 
 
 def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
-    """Return a cell's calls in item order. Raises TrapsError if there are no items."""
+    """Return the calls that ask a model about a cell's items, in order. Raises TrapsError without items."""
     entry = get_model(cell.evaluation.model)
     items = asked_items(workspace, cell.dataset)
     if not items and not workspace.tables.state(ITEMS, {"dataset": cell.dataset}):  # a held-out set may have none of it

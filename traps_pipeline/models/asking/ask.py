@@ -8,23 +8,24 @@ import asyncio
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.progress import Tally
-from traps_pipeline.ledger.ledger import SYNC_S, Ledger, LockGivenUp, Writer
+from traps_pipeline.ledger.ledger import Ledger, LockGivenUp
 from traps_pipeline.ledger.rows import is_settled
 from traps_pipeline.models.asking.backends import make_backend
 from traps_pipeline.models.asking.draining import drain_on_interrupt
-from traps_pipeline.models.asking.participants import CallContext, Participant, Participants, Row, ask_once, ledger_row
+from traps_pipeline.models.asking.participants import Participants, Row
 from traps_pipeline.models.asking.refusals import CONTROL, RefusedCalls, control_outcome, refusal, refused_calls
+from traps_pipeline.models.asking.workers import Asking, EvaluationState, HeldRow
 from traps_pipeline.models.money.budget import Budget, BudgetReached
 from traps_pipeline.models.money.spending import open_budget, share_accounts
 from traps_pipeline.models.registry.entries import NETWORK, Entry
-from traps_pipeline.models.request import Backend, Outcome, Request
+from traps_pipeline.models.request import Backend, Request
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.workspace import Workspace
@@ -64,7 +65,7 @@ class SettledCell(Generic[AnyCell, AnyCall]):
 
 @dataclass(frozen=True)
 class Work(Generic[AnyCell, AnyCall, Finished]):
-    """A stage's calls by cell, and `finish`, which makes its table."""
+    """A stage's work: who is asked, under which budget, each cell's calls, and how its table is made."""
 
     stage: str
     ledger: Ledger
@@ -131,157 +132,98 @@ def _by_evaluation(cells: Sequence[AnyCell]) -> list[tuple[Evaluation, list[AnyC
     return [(evaluation, list(group)) for evaluation, group in groupby(ordered, key=lambda cell: cell.evaluation)]
 
 
-@dataclass
-class _Asking:
-    """Workers over an evaluation's missing requests. again: what to record of a call that is repeated to settle it."""
+_AHEAD = 64  # calls of cells that are begun, beyond which another waits for the first: their rows are held
 
-    work: Work[Any, Any, Any]
-    writer: Writer
-    missing: Sequence[Request]
-    stop: asyncio.Event
-    again: Callable[[Outcome], Outcome] | None = None
-    rows: dict[str, Row] = field(default_factory=dict)
-    problems: list[Exception] = field(default_factory=list)
 
-    async def worker(self, participant: Participant, queue: deque[Request]) -> None:
+class _CellTask(Generic[AnyCell, AnyCall]):
+    """A cell that is being settled. before: cells of its evaluation that were begun before it.
+
+    keys: those of its calls. n_missing: how many the ledger lacks. all_sent: set once no call of it waits to be sent.
+    """
+
+    def __init__(
+        self,
+        work: Work[AnyCell, AnyCall, Any],
+        cell: AnyCell,
+        its: EvaluationState,
+        before: "Sequence[_CellTask[AnyCell, AnyCall]]",
+    ) -> None:
+        self._work, self._cell, self._its = work, cell, its
+        self.keys, self.n_missing, self.all_sent = set[str](), 0, asyncio.Event()
+        self.task = asyncio.create_task(self._settle(before))
+        self.task.add_done_callback(lambda _: self.all_sent.set())
+
+    async def _settle(self, before: "Sequence[_CellTask[AnyCell, AnyCall]]") -> SettledCell[AnyCell, AnyCall] | None:
+        """Ask for the missing calls; return None if that was stopped."""
         try:
-            while await self.one(participant, queue):
-                pass
-        except Exception as error:  # noqa: BLE001 - raised by `run`, once the calls in flight are in the ledger
-            self.problems.append(error)
+            calls = self._work.calls(self._cell)
+            requests = {call.request.key: call.request for call in calls}
+            self.keys.update(requests)
+            for other in before:
+                if other.keys & self.keys:  # a call that two cells share (a steered control) is paid once
+                    await asyncio.wait([other.task])
+            rows, asker = await self._ask_missing(requests)
+            if self._its.stop.is_set() or len(rows) < len(requests):
+                return None
+            for refused in refused_calls(requests.values(), rows):
+                rows |= await _settle_refusals(asker, refused, rows)
+            if self._its.stop.is_set():
+                return None
+            await self._its.writer.sync()
+        except BaseException:
+            self._its.is_over = True
+            raise
+        errors = sum(not is_settled(row) for row in rows.values())
+        tally = Tally(asked=len(asker.missing), cached=len(requests) - len(asker.missing), errors=errors)
+        return SettledCell(self._cell, calls, {key: rows[key] for key in requests}, tally)
 
-    async def one(self, participant: Participant, queue: deque[Request]) -> bool:
-        """Ask and record one request of the queue; return False if none is left."""
-        if not queue or self.halted():
-            return False
-        request, name = queue.popleft(), participant.entry.id
-        context = CallContext(self.work.budget, self.stop, self.halted, self.writer.require)
-        attempt_result = await ask_once(participant, request, context)
-        if attempt_result is None:
-            return False
-        outcome = attempt_result[0] if self.again is None else self.again(attempt_result[0])
-        row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
-        progress.current().called(name, not is_settled(row), row["latency_s"], row["cost_usd"] or 0.0)
-        if self.again is None:
-            participant.breaker.watch(outcome)
-        return True
-
-    async def write(self, request: Request, outcome: Outcome, attempts: int, seconds: float, paid_by: list[str]) -> Row:
-        row, side_texts = ledger_row(request, outcome, attempts, seconds, self.work.epoch)
-        await self.writer.write(row, side_texts, paid_by)
-        self.rows[request.key] = _Held(row)
-        return row
-
-    def halted(self) -> bool:
-        """Return whether to stop sending calls."""
-        return self.stop.is_set() or bool(self.problems)
-
-    async def sync(self) -> None:
-        while True:
-            await asyncio.sleep(SYNC_S)
-            try:
-                await self.writer.sync()
-            except TrapsError as error:  # a disk that cannot be synced stops new calls
-                self.problems.append(error)
-                return
-
-    async def run(self) -> None:
-        """Ask for all that is missing; record calls in flight before raising an error."""
-        queues: dict[str, deque[Request]] = {}
-        for request in self.missing:
-            queues.setdefault(request.participant, deque()).append(request)
-        queue_of = [(self.work.participants[name], queue) for name, queue in queues.items()]
-        sync_task = asyncio.create_task(self.sync())
-        try:
-            async with asyncio.TaskGroup() as group:
-                for participant, queue in queue_of:
-                    for _ in range(min(participant.entry.limits.concurrency, len(queue))):
-                        group.create_task(self.worker(participant, queue))
-        finally:
-            sync_task.cancel()
-        if self.problems:
-            raise self.problems[0]
-
-
-class _Held(Mapping[str, Any]):
-    """A ledger row without its components, which the request holds too."""
-
-    __slots__ = ("_places", "_values")
-    _shared: ClassVar[dict[tuple[str, ...], dict[str, int]]] = {}
-
-    def __init__(self, row: Row) -> None:
-        names = tuple(name for name in row if name != "components")
-        self._places = self._shared.setdefault(names, {name: place for place, name in enumerate(names)})
-        self._values = tuple(row[name] for name in names)
-
-    def __getitem__(self, name: str) -> Any:
-        return self._values[self._places[name]]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-
-@dataclass(frozen=True)
-class _Evaluation:
-    """State that the cells of an evaluation share: writer, and ledger places reported."""
-
-    writer: Writer
-    reported: set[str]
+    async def _ask_missing(self, requests: Mapping[str, Request]) -> tuple[dict[str, Row], Asking]:
+        """Ask for the requests that the ledger lacks; return the rows of all that were answered, and the asker."""
+        work, its, report = self._work, self._its, progress.current()
+        recorded_rows = await asyncio.to_thread(work.ledger.read, self._cell.evaluation.key, requests)
+        for location in sorted({*recorded_rows.notes} - its.reported):
+            report.note(f"{location}: {recorded_rows.notes[location]}")
+        its.reported.update(recorded_rows.notes)
+        rows: dict[str, Row] = {key: HeldRow(row) for key, row in recorded_rows.settled.items()}
+        missing = [request for key, request in requests.items() if key not in rows]
+        if not work.is_counted:
+            counts = Counter((request.participant, key in rows) for key, request in requests.items())
+            report.asking(work.stage, _by_name(counts), self._cell.share)
+        self.n_missing = len(missing)
+        asker = Asking(its, missing, self.all_sent)
+        await asker.run()
+        return rows | asker.rows, asker
 
 
 async def settle_evaluation(
     work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall]]:
-    """Settle one evaluation's cells by asking missing calls; yield the finished ones.
+    """Ask for the missing calls of one evaluation's cells; yield the finished cells in order.
 
-    Calls and rows are held one cell at a time; a call that two cells share (a steered control) is found by the second.
+    While the last calls of a cell are in flight, those of the next are sent, so that no connection is idle.
     """
-    reported_keys = set[str]()
     async with work.ledger.writing(evaluation.key, progress.current().note, stop.is_set) as writer:
-        for cell in cells:
-            settled_cell = await _settle_cell(work, cell, _Evaluation(writer, reported_keys), stop)
-            if settled_cell is None:
-                return  # finished answers are in the ledger
-            yield settled_cell
-            del settled_cell
-            await asyncio.sleep(0)  # let the loop run calls of other cells after a fully known one
+        its = EvaluationState(work.participants, work.budget, work.epoch, writer, stop)
+        upcoming, begun = deque(cells), deque[_CellTask[AnyCell, AnyCall]]()
+        try:
+            while upcoming or begun:
+                is_full = bool(begun) and (not begun[0].n_missing or sum(each.n_missing for each in begun) >= _AHEAD)
+                if upcoming and not is_full:
+                    begun.append(_CellTask(work, upcoming.popleft(), its, [*begun]))
+                    await begun[-1].all_sent.wait()
+                    continue
+                if (settled_cell := await begun[0].task) is None:
+                    await asyncio.gather(*(each.task for each in begun))  # raises why, unless all was stopped
+                    return  # finished answers are in the ledger
+                begun.popleft()
+                yield settled_cell
+                del settled_cell
+        finally:
+            its.is_over = True
+            await asyncio.gather(*(each.task for each in begun), return_exceptions=True)  # records calls in flight
 
 
-async def _settle_cell(
-    work: Work[AnyCell, AnyCall, Any], cell: AnyCell, its: _Evaluation, stop: asyncio.Event
-) -> SettledCell[AnyCell, AnyCall] | None:
-    """Ask for a cell's missing calls; return None if that was stopped."""
-    report = progress.current()
-    calls = work.calls(cell)
-    requests = {call.request.key: call.request for call in calls}
-    recorded_rows = await asyncio.to_thread(work.ledger.read, cell.evaluation.key, requests)
-    for location in sorted({*recorded_rows.notes} - its.reported):
-        report.note(f"{location}: {recorded_rows.notes[location]}")
-    its.reported.update(recorded_rows.notes)
-    rows = {key: _Held(row) for key, row in recorded_rows.settled.items()}
-    missing = [request for key, request in requests.items() if key not in rows]
-    if not work.is_counted:
-        counts = Counter((request.participant, key in rows) for key, request in requests.items())
-        report.asking(work.stage, _by_name(counts), cell.share)
-    asker = _Asking(work, its.writer, missing, stop)
-    await asker.run()
-    rows |= asker.rows
-    if stop.is_set() or len(rows) < len(requests):
-        return None
-    for refused in refused_calls(requests.values(), rows):
-        rows |= await _settle_refusals(asker, refused, rows)
-    if stop.is_set():
-        return None
-    await its.writer.sync()
-    errors = sum(not is_settled(row) for row in rows.values())
-    tally = Tally(asked=len(missing), cached=len(requests) - len(missing), errors=errors)
-    return SettledCell(cell, calls, {key: rows[key] for key in requests}, tally)
-
-
-async def _settle_refusals(asker: _Asking, calls: RefusedCalls, rows: Mapping[str, Row]) -> dict[str, Row]:
+async def _settle_refusals(asker: Asking, calls: RefusedCalls, rows: Mapping[str, Row]) -> dict[str, Row]:
     """Ask refused calls again, then one that was answered; return the new rows of the former."""
     again = replace(asker, missing=calls.refused, again=lambda outcome: outcome, rows={})
     await again.run()
@@ -297,7 +239,7 @@ async def _settle_refusals(asker: _Asking, calls: RefusedCalls, rows: Mapping[st
 async def settle(
     work: Work[AnyCell, AnyCall, Any], cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall] | Exception]:
-    """Settle all cells, models in parallel; a failing model yields its exception."""
+    """Ask for the missing calls of all cells, models in parallel; a failing model yields its exception."""
     results: asyncio.Queue[SettledCell[AnyCell, AnyCall] | Exception | None] = asyncio.Queue()
     write_turn = asyncio.Semaphore(1)  # a cell waits here with its rows until the one before it is written
 
@@ -338,7 +280,7 @@ async def settle(
 
 
 def run_work(work: Work[AnyCell, AnyCall, Finished], cells: Sequence[AnyCell]) -> Iterator[Finished]:
-    """Settle cells and finish each (write its table) just before it is yielded.
+    """Ask for the missing calls of all cells; yield each cell once its table is written.
 
     The first Ctrl-C, SIGTERM or SIGHUP stops new calls and waits for those in flight, a second one stops at once;
     either way KeyboardInterrupt is raised and the same command continues later. A caller that closes the iterator early

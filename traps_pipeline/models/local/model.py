@@ -177,7 +177,7 @@ class LocalModel:
         return text
 
     def caching_clips(self) -> AbstractContextManager[None]:
-        """Cache the vision tower's output per clip within the block (`clips`)."""
+        """Cache the vision tower's output per clip within the block."""
         return self.clips.remembering(self.network)
 
     # --- hidden states ------------------------------------------------------------------------------------------------
@@ -312,7 +312,7 @@ class LocalModel:
 
 
 def shown_frames(marks: Sequence[int]) -> int:
-    """Return the frames of a clip of which these (N,) are shown, one in so many.
+    """Return the number of a clip's frames, as computed from the indices of the N shown.
 
     Classes that take one number for the step compute it as this over N (Qwen2.5-VL).
     """

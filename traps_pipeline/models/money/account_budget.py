@@ -79,7 +79,7 @@ class AccountBudget:
                 self._add(self._read(), dollars)
 
     def explain(self, worst_usd: float) -> str:
-        """Return why there is no room for a call."""
+        """Return a sentence that says why an account's budget has no room for a call."""
         spent_usd = self.spent_usd
         return (
             f"the budget of the account {self.account} is reached: {len(spent_usd)} studies have spent "

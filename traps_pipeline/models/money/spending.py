@@ -35,7 +35,7 @@ def open_budget(workspace: Workspace, participants: Iterable[Entry]) -> Iterator
 
 @contextmanager
 def share_accounts(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
-    """Use these participants in the block; yield a counter of an account's processes."""
+    """Announce which accounts this process uses; yield a counter of an account's processes."""
     accounts = {entry.account for entry in participants if entry.account}
     if not accounts:
         yield lambda account: 1

@@ -41,7 +41,7 @@ _TOKEN_CHARACTERS = 128  # of the longest token in any usual vocabulary
 
 @dataclass(frozen=True)
 class Reading:
-    """An interpreted row.
+    """An answer as the reader of raw texts understands it.
 
     outcome: as in the ledger, or `degenerate`; text: for judges, None if they are shown nothing; reasoning: the trace;
     is_json: whether the text is the requested object, if one was requested; why: what is wrong with a text that is no

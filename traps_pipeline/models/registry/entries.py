@@ -264,7 +264,7 @@ def _add(
     entries[entry.id] = entry
 
 
-def with_own(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
+def with_user_entries(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_Entry]) -> dict[str, _Entry]:
     """Return a registry's entries, then those of the experiment and the workspace."""
     context = {"accounts": load_accounts()}
     for path, raw in user_registry.entries(key):
@@ -277,7 +277,7 @@ def with_own(entries: dict[str, _Entry], key: user_registry.Kind, kind: type[_En
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     """Return models by id, in file order. Raises TrapsError naming entry and field."""
     models = read_entries(path, "models", ModelEntry)
-    return with_own(models, "models", ModelEntry) if path == MODELS_FILE else models
+    return with_user_entries(models, "models", ModelEntry) if path == MODELS_FILE else models
 
 
 @user_registry.cached_registry

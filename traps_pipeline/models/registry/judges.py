@@ -25,7 +25,7 @@ from traps_pipeline.models.registry.entries import (
     is_reference,
     read_entries,
     user_registry,
-    with_own,
+    with_user_entries,
 )
 from traps_pipeline.models.registry.prompts import load_prompt
 from traps_pipeline.models.registry.schemas import structured_output
@@ -132,7 +132,7 @@ class JudgeEntry(Entry):
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
     """Return judges by id. Raises TrapsError naming judge and field."""
     judges = read_entries(path, "judges", JudgeEntry)
-    return with_own(judges, "judges", JudgeEntry) if path == JUDGES_FILE else judges
+    return with_user_entries(judges, "judges", JudgeEntry) if path == JUDGES_FILE else judges
 
 
 def thinking_of(judge: str) -> Marks | None:

@@ -119,7 +119,7 @@ def registries() -> list[tuple[Path, UserRegistry]]:
 
 
 def all_additions() -> UserRegistry:
-    """Return the union of all `registries`."""
+    """Return the models, judges and panels that experiments and packages add, together."""
     registry_union = UserRegistry()
     for _, registry in registries():
         registry_union |= registry

@@ -48,7 +48,7 @@ class LenientHandler(ResponseHandler):
         super().feed_data(data, size)
 
     def data_received(self, data: bytes) -> None:
-        """Hand on what belongs to the answer."""
+        """Pass a response's bytes to the HTTP parser, its head made readable."""
         if self.is_asked and data and self._is_head:
             self._head += data if self._head else data.lstrip(b"\r\n")
             end = _END.search(self._head, max(0, len(self._head) - len(data) - 3))  # what came before holds no end

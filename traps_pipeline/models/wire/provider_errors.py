@@ -73,7 +73,7 @@ _PASSES = "#token-limit"
 
 @dataclass(frozen=True)
 class ProviderError:
-    """A provider's error.
+    """An error that a provider reports in the body of its response.
 
     words: its codes and types; status: the HTTP status that it carries or stands for, None if unknown; details: the
     error object and those in it; is_filtered: whether a filter, a policy or a moderation refused the content;

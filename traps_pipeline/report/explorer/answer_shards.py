@@ -49,7 +49,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class StudyAnswers:
-    """A study's answers.
+    """A study's answers as indexed arrays, from which the explorer's files are cut.
 
     items: ITEMS rows with `family`, in order. evaluations: in order. decisions: one row per answer: item and evaluation
     by index, outcome (the answer's, or UNREAD) and epoch by index in `outcomes` and `epochs`, abstained and correct as

@@ -47,7 +47,7 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
-    """Limit the axes to points (columns j, acc), and draw PECS contours.
+    """Set axes of J and accuracy that hold all points, and draw contours of PECS.
 
     At least half of each axis is shown. intervals: whether the limits include the points' 95 % intervals.
     """

@@ -42,7 +42,7 @@ def overall(results: Results) -> list[PrintedTable]:
 
 
 def replication_overall(results: Results) -> list[PrintedTable]:
-    """Return the replication families, overall."""
+    """Return the leaderboard over all datasets, of models of the replication group."""
     return [_overall(results, "replication_overall", "Replication families, overall", replication=True)]
 
 

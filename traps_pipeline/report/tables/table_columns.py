@@ -92,12 +92,12 @@ def entries(results: Results) -> pd.DataFrame:
 
 
 def mark_notes(rows: pd.DataFrame) -> list[str]:
-    """Return the meanings of the marks in these rows."""
+    """Return notes that explain the marks (‡, §, ...) in rows of a leaderboard."""
     return meanings(rows["mark"])
 
 
 def meanings(marks: Iterable[str]) -> list[str]:
-    """Return the meaning of each of these marks, once."""
+    """Return a note for each mark (‡, §, ...), once."""
     used_marks = set(marks)
     return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used_marks]
 
@@ -120,7 +120,7 @@ def epochs(rows: pd.DataFrame) -> str:
 
 
 def printed_columns(results: Results, rows: pd.DataFrame, columns: Sequence[Column]) -> list[Column]:
-    """Return the columns to show: all for a study, for the paper those that it prints."""
+    """Return a table's columns: all for a study, the printed ones for the paper."""
     is_complete = results.is_study or not len(rows)
     return [c for c in columns if is_complete or c.field not in rows or not rows.loc[:, c.field].isna().all()]
 
@@ -168,7 +168,7 @@ def rightly_empty(table: PrintedTable, run: bool) -> PrintedTable:
 
 
 def no_overall(results: Results, replication: bool) -> str:
-    """Return why there is no overall row."""
+    """Return a sentence that says why a table has no row over all datasets."""
     if replication:
         return "no model of the replication families has all four datasets"
     return "no model has all four datasets" if len(results.cells) else results.why("cells")

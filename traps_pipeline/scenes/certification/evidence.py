@@ -119,7 +119,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Certificate:
-    """A promise about a pair.
+    """A statement about a pair that measurements prove: evidence, threshold and sentence.
 
     about: what must be there to measure it; words come last, after a draw has its place in its family.
     measure(pair): all its `numbers`. judge(evidence, claim): what is wrong with the evidence, gravest first; a number

@@ -45,7 +45,7 @@ class Resolved:
 
     @property
     def worlds(self) -> dict[str, np.ndarray]:
-        """The trajectories by name."""
+        """The trajectories of a drawn scenario: its own and those of other worlds, by name."""
         return {"qpos": self.qpos, "twin": self.twin}
 
 

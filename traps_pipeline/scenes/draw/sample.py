@@ -214,7 +214,7 @@ class Records:
             trajectory.unlink()
 
     def read(self, tally: Tally) -> list[SceneSpec]:
-        """Return the records of the draws in the tally; drop a record after them."""
+        """Return the records of the draws counted so far; drop a record written after a crash."""
         if not self._lines.is_file():
             return []
         specs = []

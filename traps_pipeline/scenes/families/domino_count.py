@@ -109,7 +109,7 @@ def build(p: Params, physics: Physics) -> Scene:
 
 
 def twins(p: Params) -> list[Params]:
-    """Return the same rows with the gap where another choice is right."""
+    """Return other worlds behind the same void: the gap stands where another count is right."""
     right, places = range_of(p.ranges, p.gap_after), range(1, len(p.second) + 1)
     return [replace(p, gap_after=n) for n in places if range_of(p.ranges, n) != right]
 

@@ -59,7 +59,7 @@ class Params:
 
 
 def twins(p: Params) -> list[Params]:
-    """Return the same drop with the ridge on the other side of it."""
+    """Return another world behind the same void: the ridge stands on the drop's other side."""
     return [replace(p, offset_m=-p.offset_m)]
 
 

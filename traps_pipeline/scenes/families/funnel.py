@@ -63,7 +63,7 @@ class Params:
 
 
 def twins(p: Params) -> list[Params]:
-    """Return the same funnel with the other throat."""
+    """Return another world behind the same void: the funnel has the other throat."""
     return [replace(p, half_throat=p.other_half_throat, other_half_throat=p.half_throat)]
 
 

@@ -62,7 +62,7 @@ def turn_quaternion(angle_rad: float, axis: int) -> list[float]:
 
 
 class Board:
-    """A board under construction.
+    """A pegboard whose pegs, walls and bins are being placed.
 
     spec: MuJoCo's description of its world. body: the board's body, whose y axis runs up the slope and whose z axis
     stands on it. deep: how far the glass is from the board (m). light: brightness of the key light, which comes almost

@@ -98,7 +98,7 @@ class Course:
         self._marks: dict[str, tuple[Vec3, Sequence[float]]] = {}  # phrase -> foot in the world, colour
 
     def towards(self, direction: int) -> Course:
-        """Return the same world with its way to a side, to write two sides once."""
+        """Return a copy of the course that builds towards a side (+1: right), so that a family writes one side."""
         course = copy(self)
         course.direction = direction
         return course
@@ -426,7 +426,7 @@ class Course:
         colours: Sequence[str] = (),
         shown_by: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> Scene:
-        """Return the built scene.
+        """Return the finished scene: compiled model, roles of bodies, camera.
 
         decisive, hidden, cover, in_view: `kit.Scene` (there, in_view is `framed`). things: phrases that single out one
         thing in view, each ends in its noun ('red ball'). also: further nouns in view. colours: those in view that no

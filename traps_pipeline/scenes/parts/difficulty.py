@@ -43,7 +43,7 @@ BALL_COLOURS: dict[str, Colour] = {colour: colour for colour in get_args(Colour)
 
 @dataclass(frozen=True)
 class Difficulty:
-    """Settings of a draw.
+    """Settings of difficulty with which scenarios are drawn.
 
     distractors: their number. speed: factor on the speed of all events. longer: rows, lanes and counts from the
     longer ranges of their family.

@@ -229,7 +229,7 @@ def has_fallen(thing: str) -> Observer:
 
 
 def has_begun(thing: str, reach: float) -> Observer:
-    """Return an observer of whether the thing has left its place or is struck next."""
+    """Return an observer that reads whether a thing has begun to move, or is about to be struck."""
 
     def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         first, last = largest(frames[0], slots[thing], 60), largest(frames[-1], slots[thing], 60)

@@ -42,7 +42,7 @@ def undecided(motion: Motion) -> Labels:
 
 
 def label_from(first: int, label: str, motion: Motion) -> Labels:
-    """Return a label from a frame on."""
+    """Return an outcome that is undecided before a frame and this label from it on."""
     return [label if i >= first else None for i in range(len(motion.times))]
 
 

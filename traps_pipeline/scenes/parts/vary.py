@@ -60,7 +60,7 @@ def several_between(count: Count, low: float, high: float) -> Any:
 
 
 def one_of(*values: Any, longer: tuple[Any, ...] = ()) -> Any:
-    """Return a field with one of these values, each equally likely.
+    """Declare a parameter that is drawn from given values, each equally likely.
 
     longer: the values instead, where a draw asks for longer rows.
     """
@@ -138,7 +138,7 @@ def together(draw: Callable[[np.random.Generator, Drawn], Sequence[Any]]) -> Gro
 
 
 def hidden(*values: Any) -> Any:
-    """Return the field of the hidden element: one of these values, drawn by itself."""
+    """Declare the parameter of the hidden element, drawn from given values apart from all others."""
     return _hidden(lambda so_far: values)
 
 

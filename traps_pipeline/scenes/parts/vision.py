@@ -199,7 +199,7 @@ def _levels(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def without_flags(frames: np.ndarray) -> np.ndarray:
-    """Return the frames with every flag painted over by what is beside it.
+    """Return frames (F, H, W, 3) whose flags are painted over with the colours beside them.
 
     A flag is a small upright patch of one colour at the top of a thin dark mast, to its right; both stand still. Of a
     black flag the mast is told apart only below.

@@ -52,7 +52,7 @@ def _unusable(reason: str) -> str:
 
 
 def encode_clip() -> str:
-    """Encode three frames and read them back. Raises TrapsError."""
+    """Check that video can be written and read: encode three frames, decode them. Raises TrapsError."""
     import numpy as np
 
     from traps_pipeline.video.encode import decode, encode

@@ -49,7 +49,7 @@ class Scenario:
 
     @property
     def fps(self) -> int:
-        """Frames a second."""
+        """The clip's frames per second."""
         return self.control.physics.fps
 
     @cached_property

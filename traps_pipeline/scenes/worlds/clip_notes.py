@@ -25,7 +25,7 @@ class Clip:
 
     @property
     def duration_s(self) -> float:
-        """Seconds shown."""
+        """The clip's duration in seconds."""
         return self.n_frames / self.fps
 
 

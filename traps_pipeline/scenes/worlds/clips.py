@@ -37,7 +37,7 @@ class Job:
 
     @property
     def clips(self) -> tuple[Path, Path, Path]:
-        """All files of the job."""
+        """The clip files that the rendering job writes."""
         return self.control, self.void, self.twin
 
 

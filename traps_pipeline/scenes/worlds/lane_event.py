@@ -43,24 +43,24 @@ class LaneEvent:
 
     @property
     def cover(self) -> Box:
-        """What a board must hide."""
+        """The box that a board must hide so that the event's outcome is not seen."""
         if self.scene.cover is None:
             raise Rejected(f"{self.family.name}: its scenes have nothing that a board could hide")
         return self.scene.cover
 
     @cached_property
     def qpos(self) -> np.ndarray:
-        """The trajectory, (F, nq)."""
+        """The event's trajectory: joint positions of each frame, (F, nq)."""
         return simulated(self.model, self.scene, self.physics)
 
     @cached_property
     def motion(self) -> Motion:
-        """Poses of all bodies."""
+        """Poses of all bodies of the event, by frame."""
         return replay(self.model, self.qpos, self.physics)
 
     @cached_property
     def outcome(self) -> Outcome:
-        """The outcome."""
+        """The event's outcome: the answer if it is seen."""
         return read_outcome(self.family, self.motion, self.params)
 
     @cached_property

@@ -67,7 +67,7 @@ class Layout:
 
     @property
     def corners(self) -> np.ndarray:
-        """Corners of strip, boards, and bench up to the highest place of doubles, (N, 3)."""
+        """Points (N, 3) that the camera must see: strip, boards, and bench up to the highest double."""
         (x, y, z), (across, deep) = self.bench, self.bench_half
         high = max(above for path in self.paths for _, above in path)
         bench = Box((x - across, y - deep, z - BENCH_M), (x + across, y + deep, z + high + CLEAR_M))

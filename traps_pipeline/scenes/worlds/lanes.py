@@ -54,7 +54,7 @@ class TwoLanes:
 
     @property
     def physics(self) -> Physics:
-        """Solver settings and timing."""
+        """MuJoCo's solver settings, and the seconds of simulation."""
         return self.events[0].physics
 
     def with_event(self, lane: int, event: LaneEvent) -> TwoLanes:
@@ -64,7 +64,7 @@ class TwoLanes:
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled world."""
+        """The MuJoCo model of both lanes."""
         spec = new_spec(self.physics)
         spec.light("key").castshadow = False
         apply_look(Scene(spec, View(), (), tuple(layout.strip for layout in self.layouts)), self.look)

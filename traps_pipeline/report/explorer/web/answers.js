@@ -163,8 +163,7 @@ function answerLine(found, row, terms) {
 // The beginning of an answer, or the place of its text, reasoning or votes where the words stand.
 function excerpt(read, terms) {
   const places = [
-    ["", read.text],
-    ["it began: ", read.fragment],
+    read.fragment ? ["it began: ", read.fragment] : ["", read.text],
     ["reasoning: ", read.reasoning],
     ...read.votes.map((vote) => [`${vote.judge}: `, vote.rationale]),
   ];

@@ -48,7 +48,7 @@ async function landscapeView(route) {
       ),
       shown.length
         ? section(null, plane(info, shown, regime), planeTable(info, shown))
-        : section(null, notice(`${NOT_RUN}: no metrics of this kind in the study`)),
+        : section(null, notice(own.some(here) ? "no point: too few answers are decided" : `${NOT_RUN}: no such metrics`)),
     ],
   };
 }

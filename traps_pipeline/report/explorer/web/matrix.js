@@ -70,7 +70,8 @@ async function matrixView(route) {
 function matrixCell(counts, which, filter) {
   const total = counts.reduce((sum, value) => sum + value, 0);
   if (!total) return h("span", { class: "absent" }, NOT_RUN);
-  const share = percent(counts[which] / total, 0);
+  const undecided = counts[MISSING] === total && which !== MISSING;
+  const share = undecided ? NONE : `${percent(counts[which] / total, 0)}\u00a0%`;
   return h(
     "a",
     {
@@ -79,6 +80,6 @@ function matrixCell(counts, which, filter) {
       title: `${counts[which]} of ${counted(total, "pair")}`,
     },
     bar(counts),
-    h("span", { class: "share" }, `${share}\u00a0%`),
+    h("span", { class: "share" }, share),
   );
 }
