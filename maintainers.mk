@@ -1,5 +1,5 @@
 # What maintainers do: measurements, locks, releases, other libraries. Included by the Makefile, whose variables it uses.
-.PHONY: coverage bench bench-cluster test-newest test-cluster test-cluster-gate test-cluster-kills lock explorer-check explorer-vendor wheel sbom release release-check environments
+.PHONY: coverage bench bench-cluster test-newest test-cluster test-cluster-launcher test-cluster-kills lock explorer-check explorer-vendor wheel sbom release release-check environments
 
 # Of the versions that pyproject.toml admits, those that pip finds today. torch stays the one of `make setup`.
 test-newest: VENV := .workspaces/newest
@@ -33,8 +33,8 @@ test-cluster: cluster-setup ## two studies on two nodes of Ray, one killed in mi
 test-cluster-kills: cluster-setup ## a study on a cluster while this and that is killed, in about half an hour (docs/cluster.md)
 	$(BIN)/python -m bench.cluster_kills run cap node stopped postgres network head store together
 
-test-cluster-gate: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
-	$(BIN)/python bench/cluster_gate.py
+test-cluster-launcher: cluster-setup ## kill Dagster's runs on Ray in every way, in about ten minutes (docs/cluster.md)
+	$(BIN)/python bench/cluster_launcher.py
 
 bench: setup ## ratios against what one would otherwise use; each script has --quick
 	$(BIN)/python bench/render.py

@@ -28,7 +28,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from dagster import DagsterInstance
 
-from bench.cluster_gate import Cluster
+from bench.cluster_launcher import Cluster
 from bench.cluster_study import NODES, Study
 from bench.cpu_share import is_there, of_cores
 from tests.objectstore import S3

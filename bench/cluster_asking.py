@@ -22,7 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from bench.cluster_gate import Cluster
+from bench.cluster_launcher import Cluster
 from bench.cluster_study import Study
 from tests.build.network import entry, register
 from tests.conftest import KEY, SECRET, Checkout, make_checkout

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bench.cluster_gate import Cluster, free_port
+from bench.cluster_launcher import Cluster, free_port
 from bench.cluster_study import NODES, Study, asked, failures_of, fetch, nodes_are_apart, runs_of, tables_are_equal
 from bench.cluster_watch import Opened, Orphans, Proxy, executing
 from tests.objectstore import S3

@@ -197,7 +197,7 @@ def asked(said: str) -> int:
 
 
 def main() -> None:
-    from bench.cluster_gate import Cluster
+    from bench.cluster_launcher import Cluster
     from bench.cluster_watch import Opened, executing
     from tests.objectstore import S3
     from tests.postgres import Postgres

@@ -71,7 +71,7 @@ DEPENDENCE = {  # shares of the variance that a scenario's items and an item's r
 LANES = ("other event seen", "other event hidden")  # two events: controls have the asked event seen, voids hidden
 STUDIES, RESAMPLES, PARTS = 25, 1000, 12
 N_FAMILIES = 8
-FIGURES = (
+METRICS = (
     *(f"{name}, one dataset" for name in RESAMPLED_METRICS),
     *RESAMPLED_METRICS,
     "specificity",
@@ -95,7 +95,7 @@ class Setting:
         return np.linspace(-1, 1, N_FAMILIES) * DEPENDENCE[self.dependence][2]
 
     def truth(self) -> dict[str, float]:
-        """Return the figures that these studies estimate."""
+        """Return the metrics that these studies estimate."""
         acc, abs_rec, false_abs = (
             self._share(share, way) for share, way in zip(STRENGTHS[self.strength], (1, 1, -1), strict=True)
         )
@@ -127,8 +127,8 @@ class Setting:
         return np.stack([control > -acc, one, control < false_abs, one, void > -abs_rec, one], axis=-1).astype(float)
 
 
-def cell_figures(counts: np.ndarray, drawn: Resampling, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
-    """Return ends of figures of a dataset or arm, mean over runs: (studies, 2, figures, 1 + resamples)."""
+def cell_metrics(counts: np.ndarray, drawn: Resampling, taxonomy: str, named: str, in_mean: bool) -> np.ndarray:
+    """Return ends of metrics of a dataset or arm, mean over runs: (studies, 2, metrics, 1 + resamples)."""
     scenarios, studies, runs, kinds = counts.shape
     sums = resampled_sums(drawn.scenarios[taxonomy][1], counts.reshape(scenarios, studies * runs, kinds))
     having = (counts[..., 1::2] > 0).sum(axis=0)
@@ -137,17 +137,17 @@ def cell_figures(counts: np.ndarray, drawn: Resampling, taxonomy: str, named: st
 
 
 def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) -> dict[str, np.ndarray]:
-    """Return the ends of every figure, (studies, 2, 1 + resamples), from counts by dataset and arm."""
+    """Return the ends of every metric, (studies, 2, 1 + resamples), from counts by dataset and arm."""
 
     def ends_of(name: str, in_mean: bool) -> np.ndarray:
-        return cell_figures(counts[name], drawn, _taxonomy(name), f"{model}|{name}", in_mean)
+        return cell_metrics(counts[name], drawn, _taxonomy(name), f"{model}|{name}", in_mean)
 
     of_one = ends_of(next(iter(counts)), in_mean=False)
     ends = {f"{name}, one dataset": of_one[:, :, k] for k, name in enumerate(RESAMPLED_METRICS)}
     if all(name in counts for name in LANES):
         seen, hidden = (ends_of(name, in_mean=False) for name in LANES)
         asked, other = (
-            own[:, :, RESAMPLED_METRICS.index(figure)] for own, figure in ((seen, "abs_rec"), (hidden, "false_abs"))
+            own[:, :, RESAMPLED_METRICS.index(metric)] for own, metric in ((seen, "abs_rec"), (hidden, "false_abs"))
         )
         ends["specificity"] = difference(asked, other)
     if not all(name in counts for name in DATASETS):
@@ -157,26 +157,26 @@ def ends_now(counts: Mapping[str, np.ndarray], drawn: Resampling, model: str) ->
 
 
 def draws_before(counts: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the resamples of every figure by the percentile bootstrap, (studies, resamples)."""
-    figures = {}
+    """Return the resamples of every metric by the percentile bootstrap, (studies, resamples)."""
+    metrics = {}
     for name, own in counts.items():
         scenarios, studies, runs, kinds = own.shape
         sums = resampled_sums(weights[_taxonomy(name)], own.reshape(scenarios, studies * runs, kinds))
         with np.errstate(invalid="ignore"):
             acc, false_abs, abs_rec = np.moveaxis(sums[:, 0::2] / sums[:, 1::2], 1, 0)
         stacked = np.stack([metric.formula(acc, false_abs, abs_rec) for metric in METRIC_WORDS.values()])
-        figures[name] = stacked.reshape(len(RESAMPLED_METRICS), studies, runs, -1).mean(axis=2)
-    first = next(iter(figures.values()))
+        metrics[name] = stacked.reshape(len(RESAMPLED_METRICS), studies, runs, -1).mean(axis=2)
+    first = next(iter(metrics.values()))
     draws = {f"{name}, one dataset": first[k] for k, name in enumerate(RESAMPLED_METRICS)}
-    if all(name in figures for name in LANES):
+    if all(name in metrics for name in LANES):
         asked, other = (
-            figures[name][RESAMPLED_METRICS.index(figure)]
-            for name, figure in zip(LANES, ("abs_rec", "false_abs"), strict=True)
+            metrics[name][RESAMPLED_METRICS.index(metric)]
+            for name, metric in zip(LANES, ("abs_rec", "false_abs"), strict=True)
         )
         draws["specificity"] = asked - other
-    if not all(name in figures for name in DATASETS):
+    if not all(name in metrics for name in DATASETS):
         return draws
-    overall = np.mean([figures[name] for name in DATASETS], axis=0)
+    overall = np.mean([metrics[name] for name in DATASETS], axis=0)
     return draws | {name: overall[k] for k, name in enumerate(RESAMPLED_METRICS)}
 
 
@@ -196,7 +196,7 @@ def drawn_counts(setting: Setting, rng: np.random.Generator, studies: int) -> di
 
 
 def measure(setting: Setting, studies: int, resamples: int, seed: int) -> Iterator[dict[str, object]]:
-    """Measure coverage and mean width of every figure of one setting, before and now."""
+    """Measure coverage and mean width of every metric of one setting, before and now."""
     rng = np.random.default_rng([seed, *setting.size.encode(), *setting.strength.encode()])
     names = [
         (f"{taxonomy}-{k}", taxonomy)
@@ -212,41 +212,41 @@ def measure(setting: Setting, studies: int, resamples: int, seed: int) -> Iterat
     ends = [ends_now(counts, drawn, model) for counts, model in zip(both, "ab", strict=True)]
     draws = [draws_before(counts, weights) for counts in both]
     truth = setting.truth()
-    for figure in FIGURES:
-        name = figure.removeprefix("difference of ")
+    for metric in METRICS:
+        name = metric.removeprefix("difference of ")
         if name not in ends[0]:
             continue
-        if name != figure:
+        if name != metric:
             now, before = difference(ends[0][name], ends[1][name]), draws[0][name] - draws[1][name]
             observed = ends[0][name][:, 1, 0] - ends[1][name][:, 1, 0]
         else:
             now, before, observed = ends[0][name], draws[0][name], ends[0][name][:, 1, 0]
-        limits = LIMITS.get(figure, limits_of(figure.partition(",")[0]))
+        limits = LIMITS.get(metric, limits_of(metric.partition(",")[0]))
         percentiles = np.stack([quantile(before[:, 1:], q) for q in (0.025, 0.975)], axis=-1)
         intervals = {"before": percentiles, "now": interval(now[..., 1:], observed, limits)}
-        row = {**vars(setting), "figure": figure, "truth": truth[figure], "studies": studies}
+        row = {**vars(setting), "metric": metric, "truth": truth[metric], "studies": studies}
         for which, own in intervals.items():
-            holds = (own[:, 0] <= truth[figure] + 1e-9) & (truth[figure] - 1e-9 <= own[:, 1])
+            holds = (own[:, 0] <= truth[metric] + 1e-9) & (truth[metric] - 1e-9 <= own[:, 1])
             row |= {f"coverage_{which}": holds.mean(), f"width_{which}": (own[:, 1] - own[:, 0]).mean()}
         yield row
 
 
 def mean_of_parts(setting: Setting, parts: int, seed: int) -> pd.DataFrame:
     """Measure a setting in parts of STUDIES studies, since those of one part share the weights of scenarios, and return
-    a row a figure."""
+    a row a metric."""
     rows = [row for part in range(parts) for row in measure(setting, STUDIES, RESAMPLES, seed + part)]
-    by_figure = pd.DataFrame(rows).groupby(["size", "strength", "dependence", "figure"], sort=False, as_index=False)
-    return pd.DataFrame(by_figure.mean(numeric_only=True))
+    by_metric = pd.DataFrame(rows).groupby(["size", "strength", "dependence", "metric"], sort=False, as_index=False)
+    return pd.DataFrame(by_metric.mean(numeric_only=True))
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """Return the Markdown table of lowest coverage and mean width by size and figure, before and now."""
+    """Return the Markdown table of lowest coverage and mean width by size and metric, before and now."""
     shown = ("j, one dataset", "acc", "j", "pecs", "specificity", "difference of pecs")
     lines = ["| scenarios | " + " | ".join(shown) + " |", "| --- " * (len(shown) + 1) + "|"]
     for size in SIZES:
         cells = []
-        for figure in shown:
-            own = rows.loc[(rows["size"] == size) & (rows["figure"] == figure)]
+        for metric in shown:
+            own = rows.loc[(rows["size"] == size) & (rows["metric"] == metric)]
             if own.empty:
                 cells.append("")
                 continue
@@ -257,10 +257,10 @@ def summary(rows: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def by_strength(rows: pd.DataFrame, figure: str = "pecs") -> str:
-    """Return the Markdown table of a figure's lowest coverage now, by size and strength."""
-    lines = [f"| {figure}, scenarios | " + " | ".join(STRENGTHS) + " |", "| --- " * (len(STRENGTHS) + 1) + "|"]
-    lowest = rows.loc[rows["figure"] == figure].groupby(["size", "strength"])["coverage_now"].min()
+def by_strength(rows: pd.DataFrame, metric: str = "pecs") -> str:
+    """Return the Markdown table of a metric's lowest coverage now, by size and strength."""
+    lines = [f"| {metric}, scenarios | " + " | ".join(STRENGTHS) + " |", "| --- " * (len(STRENGTHS) + 1) + "|"]
+    lowest = rows.loc[rows["metric"] == metric].groupby(["size", "strength"])["coverage_now"].min()
     for size in dict.fromkeys(rows["size"]):
         cells = (f"{lowest[size, name]:.0%}" if (size, name) in lowest.index else "" for name in STRENGTHS)
         lines.append(f"| {size} | " + " | ".join(cells) + " |")
@@ -289,7 +289,7 @@ def main() -> None:
     print(summary(table), by_strength(table), sep="\n\n")
     worst = table.sort_values("coverage_now").head(8)
     print(
-        worst[["size", "strength", "dependence", "figure", "coverage_before", "coverage_now", "width_now"]].to_string()
+        worst[["size", "strength", "dependence", "metric", "coverage_before", "coverage_now", "width_now"]].to_string()
     )
 
 

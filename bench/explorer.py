@@ -273,7 +273,7 @@ def measure(site: Path, pairs: list[tuple[str, str]], say: Callable[[str, float,
             return page
 
         for selector, hash_, target, what in (
-            ("[data-name=leaderboard] .figure", "#/", 1000, "leaderboard painted"),
+            ("[data-name=leaderboard] .metric", "#/", 1000, "leaderboard painted"),
             (".answers .answer", "#/answers", 1500, "filter over all answers usable"),
         ):
             times = []

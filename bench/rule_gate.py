@@ -1,6 +1,6 @@
 """Fail a release whose two events are passed by a rule that follows no event (docs/scoring.md, "Two events").
 
-Where a rule does not abstain it answers like an oracle, so that each figure bounds what it can earn. Frames are drawn
+Where a rule does not abstain it answers like an oracle, so that each metric bounds what it can earn. Frames are drawn
 from the records, half a second apart. Learned rules are boosted trees:
 
 A: of the clip alone. B: of the words alone. C: joined by the named colours: how much of them is in the picture in each
@@ -82,7 +82,7 @@ def rule_tables(items: pd.DataFrame) -> dict[str, pd.DataFrame]:
         decisions[f"{title} held out"] = {
             name: learned(items, columns, groups, folds) for name, columns in LEARNED.items()
         }
-    return {title: figures(items, of_rules) for title, of_rules in decisions.items()}
+    return {title: metrics(items, of_rules) for title, of_rules in decisions.items()}
 
 
 def above_limits(tables: Mapping[str, pd.DataFrame]) -> list[str]:
@@ -268,7 +268,7 @@ def learned(items: pd.DataFrame, columns: str, groups: np.ndarray, folds: int) -
     return abstains
 
 
-def figures(items: pd.DataFrame, decisions: Mapping[str, np.ndarray]) -> pd.DataFrame:
+def metrics(items: pd.DataFrame, decisions: Mapping[str, np.ndarray]) -> pd.DataFrame:
     """Return the TWO_WAY row of each rule, by its name, from whether it abstains on each item."""
     about = dict.fromkeys(("regime", "epoch", "panel", "benchmark_version"), "bench") | {
         "dataset": TWO_EVENTS,

@@ -122,7 +122,7 @@ def straightforward(verdicts: Any, entry: tuple[str, str, str], resamples: int, 
     parts = {name: decisions(mine[mine["dataset"] == name]) for name in DATASETS if dataset in (name, "overall")}
     samples = sorted({taxonomy_of(name) for name in parts}, reverse=True)  # occlusion, chaotic
 
-    def figure(formula: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    def metric(formula: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
         def statistic(*which: np.ndarray, axis: int) -> np.ndarray:
             means = []
             for name, columns in parts.items():
@@ -144,7 +144,7 @@ def straightforward(verdicts: Any, entry: tuple[str, str, str], resamples: int, 
     ends = {}
     for name, formula in formulas.items():
         ends[name] = bootstrap(
-            scenarios, figure(formula), vectorized=True, n_resamples=resamples, batch=500, method="percentile",
+            scenarios, metric(formula), vectorized=True, n_resamples=resamples, batch=500, method="percentile",
             rng=np.random.default_rng(1),
         ).confidence_interval  # fmt: skip
     seconds = time.process_time() - began

@@ -16,7 +16,7 @@ COMMENT = re.compile(r"(?:^|\s)# .*")
 PATTERN = re.compile(r"\w*[A-Z]{3,}\w*|_[a-z]{1,3}")
 DEFINED_ELSEWHERE = {
     *("settexture", "makePlane", "discrete", "AssetCheckResult", "Markup", "logit_bias"),  # by libraries and providers
-    *("domino_0", "layer_000", "control_low", "guided_results", "occluders_occlusion"),  # put together when run
+    *("domino_0", "layer_000", "control_low", "guided_results"),  # put together when run
     *("model__regime__steered", "model__directionregime__inferenceregime"),  # keys of partitions, in words
     "reservations",  # a table of the ledger, without the prefix of all its tables
 }

@@ -29,13 +29,13 @@ WORDS = {str: "text", int: "whole number", float: "number", bool: "true or false
 
 def certificates_page() -> str:
     """Return the page of the certificates: what each promises, does not promise and stores."""
-    from traps_pipeline.scenes.certification.certificates import table
+    from traps_pipeline.scenes.certification.certificates import certificate_table
 
     head = (
         "# Certificates\n\nFor readers who ask why a void is unanswerable ([scenes](../scenes.md#certificates)): every "
         "certificate of a pair. Numbers in brackets depend on OpenGL."
     )
-    return f"{head}\n\n{table()}\n"
+    return f"{head}\n\n{certificate_table()}\n"
 
 
 def tables_page() -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from traps_cluster.history import dagster_yaml
 from traps_cluster.objects import open_store
 from traps_cluster.postgres import open_ledger
+from traps_pipeline.storage.place import Place
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from traps_pipeline.pipeline.runs import Runs
 
-__all__ = ["dagster_yaml", "open_ledger", "open_store", "runs", "sensors"]
+__all__ = ["dagster_yaml", "move", "open_ledger", "open_store", "runs", "sensors"]
 
 
 def runs(workspace: Workspace, instance: dg.DagsterInstance, options: Any) -> Runs:
@@ -29,6 +30,13 @@ def runs(workspace: Workspace, instance: dg.DagsterInstance, options: Any) -> Ru
     runs = RayRuns(instance, workspace, options.runs, options.gpus, options.on_interrupt, options.cpus)
     runs.wait_for_earlier()
     return runs
+
+
+def move(workspace: Workspace, address: Place) -> int:
+    """See `SeveralHosts`."""
+    from traps_cluster.store_move import move_to_store
+
+    return move_to_store(workspace, address)
 
 
 def sensors() -> Sequence[dg.SensorDefinition]:

@@ -191,7 +191,7 @@ class PostgresDatabase(NumberedDatabase):
 
     @property
     @override
-    def put_aside(self) -> str:
+    def restart_words(self) -> str:
         return f"set {self.variable} to the address of an empty database"
 
     @override

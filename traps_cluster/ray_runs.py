@@ -20,6 +20,7 @@ from typing_extensions import override
 
 from traps_cluster.node import CODE, REFUSED_TAG, code_here
 from traps_cluster.postgres import PATIENCE_S
+from traps_cluster.run_shares import cut_keys, shared_out
 from traps_cluster.sensors import REQUEST_TAG, submit
 from traps_pipeline.base import progress
 from traps_pipeline.base.cores import CORES
@@ -31,7 +32,7 @@ from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.entries import LOCAL, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.metadata import tally_of
-from traps_pipeline.pipeline.ranges import Range, cut_keys, shared_out
+from traps_pipeline.pipeline.ranges import Range
 from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, keys_of, problems_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, UNWANTED
 from traps_pipeline.protocol.cells import Cell

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from bench import rule_gate
-from bench.rule_gate import above_limits, figures, rows_of, rule_tables
+from bench.rule_gate import above_limits, metrics, rows_of, rule_tables
 from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.records import two_events_lines
@@ -72,7 +72,7 @@ def test_a_rule_is_above_the_limits_by_its_conjunction_or_by_its_specificity():
     hidden = (frame["side"] == "void").to_numpy()
     once = hidden & frame["scenario_id"].eq("slide-e000").to_numpy()  # right about one scenario of twenty
     twice = hidden & frame["scenario_id"].isin(["slide-e000", "slide-e001"]).to_numpy()
-    table = figures(frame, {"B words": once, "C colours": twice, "A clip": np.zeros(len(frame), bool)})
+    table = metrics(frame, {"B words": once, "C colours": twice, "A clip": np.zeros(len(frame), bool)})
     assert table["conjunction"].tolist() == [1 / 20, 2 / 20, 0] and table["specificity"].tolist() == [0.05, 0.1, 0]
     failures = above_limits({"written": table.iloc[:0], "families held out": table})
     assert len(failures) == 1 and failures[0].startswith("C colours: conjunction 0.10 ")

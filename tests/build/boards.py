@@ -25,6 +25,7 @@ def board_row(model, regime="standard", dataset="overall", shares=(0.5, 0.1, 0.6
     row = {
         **{"model": model, "regime": regime, "dataset": dataset, "n_runs": 3, "n_pairs": 1404, "n_missing": 0},
         **figures,
+        "n_items": 2 * other.get("n_pairs", 1404),
         **{f"{name}_std": 0.01 for name in figures},
         # Counts of decisions are null, as of every panel that is not asked.
         **{name: None if count.is_of_decisions else 0 for name, count in COUNT_WORDS.items()},

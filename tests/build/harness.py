@@ -1,4 +1,4 @@
-"""A study's figures under the names of a harness."""
+"""A study's metrics under the names of a harness."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def ours(workspace: Workspace, model: str, regime: str) -> dict[str, float]:
-    """The leaderboard's figures under the names of a harness."""
+    """The leaderboard's metrics under the names of a harness."""
     board = workspace.tables.read_all(LEADERBOARD)
     rows = board.loc[(board["model"] == model) & (board["regime"] == regime)].to_dict("records")
     prefixed = {"" if row["dataset"] == "overall" else f"{row['dataset']}_": row for row in rows}

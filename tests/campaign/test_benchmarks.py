@@ -11,8 +11,8 @@ from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
 # They need Ray and minutes: tests/integration/test_cluster.py and pipeline/test_lost_runs.py use their parts.
-OF_CLUSTERS = {"cluster", "cluster_asking", "cluster_gate", "cluster_kills", "cluster_study", "cluster_watch"}
-PARTS = {"cpu_share", "equality", "gate_project", "quick"}  # what others import, or what compares two studies
+OF_CLUSTERS = {"cluster", "cluster_asking", "cluster_launcher", "cluster_kills", "cluster_study", "cluster_watch"}
+PARTS = {"cpu_share", "equality", "launcher_project", "quick"}  # what others import, or what compares two studies
 SCRIPTS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - OF_CLUSTERS - PARTS)
 
 

@@ -65,7 +65,7 @@ def test_the_time_left_of_a_large_cell_is_that_of_the_slices_to_come(clock: Cloc
 
 def test_a_listener_hears_of_a_stage_every_half_minute_and_at_its_end(clock: Clock) -> None:
     report, lines = Progress(), list[str]()
-    with report.heard_by(lines.append):
+    with report.reporting_to(lines.append):
         report.stage("videos", 1)
         for second in range(100):
             clock.now = float(second)
@@ -120,7 +120,7 @@ def test_no_time_is_said_to_be_left_before_a_stage_has_a_pace(clock: Clock) -> N
     assert report.line() == "votes: 1 of 4 made, 0:30 left"
 
 
-def test_lines_of_json_have_the_same_figures(clock: Clock) -> None:
+def test_lines_of_json_have_the_same_numbers(clock: Clock) -> None:
     out = io.StringIO()
     report = make_progress("json", out)
     ask(report, clock)
@@ -156,7 +156,7 @@ def test_the_calls_of_all_cells_and_those_in_flight_are_told_from_the_first_line
     assert begin["budget_usd"] == first["budget_usd"] == 20.0
     assert (first["event"], first["calls"]["gpt"]["wanted"], first["calls"]["gpt"]["done"]) == ("progress", 32, 0)
     assert (later["calls"]["gpt"]["in_flight"], later["calls"]["gpt"]["oldest_s"]) == (2, 41.0)
-    assert report.figures()["calls"]["gpt"]["in_flight"] == 0
+    assert report.state()["calls"]["gpt"]["in_flight"] == 0
 
 
 def test_a_stopped_run_says_how_many_calls_it_waits_for_and_nothing_of_what_it_would_have_made(clock: Clock) -> None:

@@ -79,7 +79,7 @@ def told(instance: dg.DagsterInstance, run: dg.DagsterRun) -> str:
 @pytest.mark.slow
 def test_a_run_that_waits_for_a_host_goes_on_waiting_and_one_that_waits_for_nothing_fails(tmp_path: Path) -> None:
     pytest.importorskip("dagster_ray", reason="the extra `cluster` is not installed")
-    from bench.cluster_gate import Cluster
+    from bench.cluster_launcher import Cluster
 
     plain = {key: value for key, value in os.environ.items() if not key.startswith(("RAY_", "DAGSTER_", "TRAPS_"))}
     with ExitStack() as opened:

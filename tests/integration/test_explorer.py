@@ -1,4 +1,4 @@
-"""The explorer in a real browser, from disk and from a web host: its figures, its ways to an answer, its silence."""
+"""The explorer in a real browser, from disk and from a web host: its metrics, its ways to an answer, its silence."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from traps_pipeline.storage.study import Study
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
-FIGURES = {m.heading: (m.name, percent if m.unit == "percent" else fraction) for m in METRIC_WORDS.values()}
+PRINTED = {m.heading: (m.name, percent if m.unit == "percent" else fraction) for m in METRIC_WORDS.values()}
 # Markup, LaTeX, a right-to-left override, a zero-width space, a byte-order mark and a tag character.
 HOSTILE = (
     '<script>parent.document.title="owned"</script><img src="http://evil.example/x.png" onerror="alert(1)"> '
@@ -130,7 +130,7 @@ def rows_of(page: Page) -> list[dict[str, str]]:
 
 
 @pytest.mark.promise
-def test_every_leaderboard_figure_is_that_of_the_table(site: Site, browser: Browser) -> None:
+def test_every_leaderboard_metric_is_that_of_the_table(site: Site, browser: Browser) -> None:
     board = site.workspace.tables.read(LEADERBOARD, {})
     compared = 0
     with visit(browser, site.address) as visited:
@@ -141,7 +141,7 @@ def test_every_leaderboard_figure_is_that_of_the_table(site: Site, browser: Brow
             assert len(shown) == len(rows)
             for wanted in rows:
                 line = shown[wanted["model"], wanted["regime"]]
-                for heading, (name, printed) in FIGURES.items():
+                for heading, (name, printed) in PRINTED.items():
                     low, high = (printed(wanted[f"{name}_ci_{end}"]) for end in ("low", "high"))
                     assert line[heading].split("\n") == [printed(wanted[name]), f"[{low}, {high}]"], (wanted, name)
                     compared += 3
@@ -154,7 +154,7 @@ def test_every_leaderboard_figure_is_that_of_the_table(site: Site, browser: Brow
         page = visited.go("#/")
         order = [(line["Model"], line["Regime"]) for line in rows_of(page)]
         assert order == [*zip(ranked.rows["model"], ranked.rows["regime"], strict=True)]
-    assert compared == 3 * len(FIGURES) * len(board) == 450
+    assert compared == 3 * len(PRINTED) * len(board) == 450
 
 
 def test_the_paper_stands_beside_the_study_and_what_was_not_run_says_so(site: Site, browser: Browser) -> None:
@@ -165,7 +165,7 @@ def test_the_paper_stands_beside_the_study_and_what_was_not_run_says_so(site: Si
         lines = {(line["Model"], line["Regime"]): line for line in rows_of(page)}
         assert len(lines) == 6 + len(published)
         for key, paper in published.iterrows():
-            for heading, (name, printed) in FIGURES.items():
+            for heading, (name, printed) in PRINTED.items():
                 assert lines[key][heading] == NOT_RUN
                 if name != "j":
                     assert lines[key][f"Paper: {heading}"] == printed(paper[name])
@@ -219,9 +219,9 @@ def test_a_comparison_counts_what_differs_and_tests_it_as_the_tables_do(site: Si
         assert numbers == [int((left & right).sum()), *only, int((~left & ~right).sum())]
         exact = Decimal(binomtest(only[0], sum(only), 0.5).pvalue)  # 1/32 of a few items: browsers round a half up
         assert p == str(exact.quantize(Decimal("0.0001"), ROUND_HALF_UP))
-        key = ["kind", "dataset", "figure", "left_model", "left_regime", "right_model"]
+        key = ["kind", "dataset", "metric", "left_model", "left_regime", "right_model"]
         found = differences.set_index(key).loc["models", "chaotic", "pecs", "oracle", "standard", "prior"]
-        lines = {(line["Dataset"], line["Figure"]): line for line in by_heading(page, "differences")}
+        lines = {(line["Dataset"], line["Metric"]): line for line in by_heading(page, "differences")}
         assert lines["Chaotic", "PECS"]["Difference"] == fraction(found["difference"])
         interval = f"[{fraction(found['ci_low'])}, {fraction(found['ci_high'])}]"
         assert lines["Chaotic", "PECS"]["95 % interval"] == interval

@@ -15,8 +15,8 @@ from tests.conftest import SMALL, Checkout, copy_of
 from tests.objectstore import S3
 from tests.postgres import Postgres
 from tests.remedies.remedied import remedied
+from traps_cluster.store_move import MOVED_STUDY, move_to_store
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.storage.store_move import MOVED_STUDY, move_to_store
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
 pytestmark = pytest.mark.slow
@@ -53,13 +53,13 @@ def test_a_finished_study_moves_into_a_store_where_nothing_is_asked_or_made_agai
     left = study.traps("status")
     assert (left.code, left.raised) == (1, "storage.workspace.Workspace.open")
     assert (study.workspace / MOVED_STUDY).is_file()
-    with raises(TrapsError, "storage.store_move.move_to_store", ADDRESS, "`traps study export-ledger`"):
+    with raises(TrapsError, "traps_cluster.store_move.move_to_store", ADDRESS, "`traps study export-ledger`"):
         move_to_store(workspace, "s3://lab/elsewhere")
     other = copy_of(one_regime, tmp_path / "other")
     named = other.workspace / "study.yaml"
     named.write_text(re.sub(r"(?m)^name: .*$", "name: another", named.read_text()))
     remedied(
         lambda: move_to_store(Workspace.open(other.workspace), ADDRESS),
-        "storage.store_move.move_to_store",
+        "traps_cluster.store_move.move_to_store",
         again=lambda: move_to_store(Workspace.open(other.workspace), "s3://lab/moved-too"),
     )

@@ -42,9 +42,9 @@ def test_gating_turns_answers_into_abstentions_and_nothing_else() -> None:
         correct=np.array([1, 1, 0, nan, nan, nan, nan, nan]),
         abstained=np.array([0, 0, 0, 0, 1, 0, 0, 0.0]),
     )
-    assert outcomes.figures() == pytest.approx({"acc": 2 / 3, "false_abs": 0, "abs_rec": 0.25, "pecs": 2 / 3 * 0.25})
+    assert outcomes.metrics() == pytest.approx({"acc": 2 / 3, "false_abs": 0, "abs_rec": 0.25, "pecs": 2 / 3 * 0.25})
     gate = np.array([True, False, False, False, False, True, True, False])
-    gated = outcomes.gated(gate).figures()
+    gated = outcomes.gated(gate).metrics()
     assert gated == pytest.approx({"acc": 1 / 3, "false_abs": 0.25, "abs_rec": 0.75, "pecs": 1 / 3 * 0.5})
 
 

@@ -119,7 +119,7 @@ def test_judged_and_corrected_equal_another_implementation(rows: Rows) -> None:
         weight=labels["stratum_size"].astype(float) / labels.groupby(["task", "stratum"])["unit"].transform("count")
     )
 
-    def figures(times: dict[str, float]) -> dict[str, float]:
+    def metrics(times: dict[str, float]) -> dict[str, float]:
         def inverse(task: str, share: float) -> float:
             own = labels.loc[labels["task"] == task]
             truth_of = own["abstained" if task == "abstention" else "correct"].astype(bool)
@@ -142,7 +142,7 @@ def test_judged_and_corrected_equal_another_implementation(rows: Rows) -> None:
             by_dataset.append((acc, abs_rec, false_abs, j, acc * max(0.0, j)))
         return dict(zip(("acc", "abs_rec", "false_abs", "j", "pecs"), np.mean(by_dataset, axis=0), strict=True))
 
-    observed = figures(dict.fromkeys(items["scenario_id"], 1))
+    observed = metrics(dict.fromkeys(items["scenario_id"], 1))
     for name in RESAMPLED_METRICS:
         assert table[f"{name}_corrected"] == pytest.approx(observed[name], abs=1e-9)
         low, high = table[f"{name}_corrected_ci_low"], table[f"{name}_corrected_ci_high"]

@@ -1,4 +1,4 @@
-"""The confabulation judge against two annotators: hand-worked figures, scikit-learn, and files with mistakes."""
+"""The confabulation judge against two annotators: hand-worked metrics, scikit-learn, and files with mistakes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def human(a: Sequence[str], b: Sequence[str]) -> HumanLabels:
     return HumanLabels(("ann", "bob"), tuple(f"s{k}" for k in range(labels.shape[1])), labels)
 
 
-def test_every_figure_of_a_fixture_worked_out_by_hand() -> None:
+def test_every_metric_of_a_fixture_worked_out_by_hand() -> None:
     judge = np.array([flags(axis) for axis in ("yyyyyyyyyy", "yyyyyynnnn", "nnnnnnnnnn", "ynynynynyn")]).T
     rows = compare(
         judge,

@@ -126,31 +126,3 @@ def test_rows_are_not_looked_at_while_their_table_is_the_same(report: Report, ve
         versions["metrics/chaotic"] = version
         make_pieces(report.workspace, "site", "1", [Piece("sheet", lambda: b"drawn", ("metrics",), look)])
     assert looked == ["1", "2"]
-
-
-def test_what_all_studies_have_in_common_is_made_once_for_a_user(
-    tmp_path: Path, versions: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    made = list[str]()
-
-    def make(study: str, code: str = "1") -> bytes:
-        def paper() -> bytes:
-            made.append(study)
-            return f"made in {study} by {code}".encode()
-
-        workspace = Workspace.create(tmp_path / study, Study())
-        contents, remade = make_pieces(workspace, "report_page", code, [Piece("paper", paper, is_shared=True)])
-        assert remade == ["paper"]
-        return contents["paper"]
-
-    assert {make("first"), make("second")} == {b"made in first by 1"}
-    assert made == ["first"]
-    assert make("third", code="2") == b"made in third by 2"
-    cache = tmp_path / "cache" / "traps" / "report_page.pieces.zip"
-    data = cache.read_bytes()
-    for number, bit in enumerate(range(0, 8 * len(data), 97)):
-        cache.write_bytes(flipped(data, bit))
-        made.clear()
-        assert make(f"study{number}", code="2") in {b"made in third by 2", f"made in study{number} by 2".encode()}
-        assert len(made) == (f"study{number}" in made)

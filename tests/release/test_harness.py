@@ -175,9 +175,9 @@ def test_answers_by_opaque_name_are_imported_with_the_key_of_the_held_out_set(
     scored = tmp_path / "key.scored"
     for new, known in ((48, 0), (0, 48)):
         finished = json.loads(unasked.traps(*command, *keyed, "--json").ok().out)
-        assert (finished["new"], finished["known"], len(scored.read_text().split())) == (new, known, 1)
-    path.write_text(json.dumps(lines[0]) + "\n")
-    assert " 2 files" in unasked.traps(*command, *keyed).ok().err
+        assert (finished["new"], finished["known"], len(scored.read_text().splitlines())) == (new, known, 1)
+    path.write_text("".join(json.dumps(lines[0] | {"regime": regime}) + "\n" for regime in ("json", "standard")))
+    assert " 3 scores" in unasked.traps(*command, *keyed).ok().err  # of two files, one of them under two regimes
     assert imported_texts(workspace, "random-50", "json") == {id_: given[id_] for id_ in ids}
 
 

@@ -75,7 +75,7 @@ def served(demo: Checkout, released: Path, tmp_path_factory: pytest.TempPathFact
         yield Served(url, folder / "harness", Workspace.open(study.workspace))
 
 
-def test_inspect_ai_gets_the_same_answers_and_figures(request: pytest.FixtureRequest, tmp_path: Path) -> None:
+def test_inspect_ai_gets_the_same_answers_and_metrics(request: pytest.FixtureRequest, tmp_path: Path) -> None:
     python_of("inspect")
     served: Served = request.getfixturevalue("served")
     # As docs/release.md says it, but into a folder of the test (by its name inspect knows it for installed), offline.
@@ -95,7 +95,7 @@ def test_inspect_ai_gets_the_same_answers_and_figures(request: pytest.FixtureReq
     assert {name: values[name] for name in expected} == expected
 
 
-def test_lmms_eval_gets_the_same_answers_and_figures(request: pytest.FixtureRequest, tmp_path: Path) -> None:
+def test_lmms_eval_gets_the_same_answers_and_metrics(request: pytest.FixtureRequest, tmp_path: Path) -> None:
     python_of("lmms")
     served: Served = request.getfixturevalue("served")
     model = ("--model", "openai", "--model_args", f"model_version={WEIGHTS},base_url={served.url},api_key=none")

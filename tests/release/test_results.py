@@ -9,9 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from tests.conftest import Checkout
+from tests.conftest import Checkout, copy_of
 from tests.release.environments import run_in
+from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.scoring.score_rows import LEADERBOARD
+from traps_pipeline.scoring.scores import score
+from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -26,7 +29,8 @@ def written(small: Checkout, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: Checkout) -> None:
-    board = Workspace.open(small.workspace).tables.read_all(LEADERBOARD)
+    tables = Workspace.open(small.workspace).tables
+    board, n_items = tables.read_all(LEADERBOARD), len(tables.read_all(ITEMS))
     assert pq.read_table(written / "leaderboard.parquet").num_rows == len(board)
     for row in board.loc[board["dataset"] == "overall"].to_dict("records"):
         hub = yaml.safe_load((written / "eval_results" / f"{row['model']}.yaml").read_text())
@@ -35,8 +39,22 @@ def test_every_form_holds_the_figures_of_the_leaderboard(written: Path, small: C
         (path,) = (written / "data" / "trapsbench" / "traps-pipeline" / row["model"]).iterdir()
         record = json.loads(path.read_text())
         scores = {one["evaluation_result_id"]: one["score_details"]["score"] for one in record["evaluation_results"]}
+        assert {one["source_data"]["samples_number"] for one in record["evaluation_results"]} == {n_items}
         for name in ("pecs", "acc", "abs_rec", "false_abs", "j"):
             assert scores[f"trapsbench/{row['regime']}/{name}"] == row[name]
+
+
+def test_results_of_a_held_out_set_count_the_items_that_it_asks(small: Checkout, tmp_path: Path) -> None:
+    study, folder = copy_of(small, tmp_path), tmp_path / "results"
+    tables = Workspace.open(study.workspace).tables
+    verdicts = tables.read_all(VERDICTS)
+    turn = verdicts["pair_id"].rank(method="dense") % 2
+    asked = verdicts.loc[(verdicts["side"] == "void") == (turn == 1)]  # one item of each pair
+    tables.write(LEADERBOARD, {}, score(asked).board, {})
+    study.traps("publish", "results", folder, "--dataset", "owner/traps").ok()
+    records = [json.loads(path.read_text()) for path in (folder / "data").rglob("*.json")]
+    counts = {one["source_data"]["samples_number"] for record in records for one in record["evaluation_results"]}
+    assert counts == {asked["item_id"].nunique()} == {verdicts["item_id"].nunique() // 2}
 
 
 def test_the_hubs_library_reads_the_results(written: Path) -> None:

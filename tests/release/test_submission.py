@@ -6,12 +6,14 @@ import hashlib
 import io
 import json
 import re
+import time
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -26,7 +28,15 @@ from traps_pipeline.models.registry.judges import BY_RULES, RULES_VERSION
 from traps_pipeline.release.content import content_of
 from traps_pipeline.release.folder import Options, write_release
 from traps_pipeline.release.released_rows import SUBMITTED
-from traps_pipeline.release.submission import ABOUT, TABLES, pack_submission, read_submission, table_bytes
+from traps_pipeline.release.submission import (
+    ABOUT,
+    MAX_TABLE_BYTES,
+    MAX_TEXT_BYTES,
+    TABLES,
+    pack_submission,
+    read_submission,
+    table_bytes,
+)
 from traps_pipeline.release.submissions import gather, write_board
 from traps_pipeline.release.verification import NOT_RECOMPUTED, released_items, verify, verify_file
 from traps_pipeline.scoring.score_rows import LEADERBOARD
@@ -224,6 +234,26 @@ def test_compressed_members_other_columns_and_other_files_are_refused(packed: Pa
         read_submission(path)
 
 
+@pytest.mark.parametrize(("size", "rows"), [(MAX_TEXT_BYTES + 1, 1), (2**20, MAX_TABLE_BYTES // 2**20 + 1)])
+def test_a_small_file_of_long_texts_or_of_one_text_in_many_rows_is_refused_before_they_are_unpacked(
+    packed: Path, tmp_path: Path, size: int, rows: int
+) -> None:
+    with zipfile.ZipFile(packed) as source:
+        content = {name: source.read(name) for name in source.namelist()}
+    table = pq.read_table(io.BytesIO(content["responses.parquet"])).take([0] * rows)
+    text = pa.DictionaryArray.from_arrays(pa.array([0] * rows, pa.int32()), pa.array(["x" * size]))
+    table = table.set_column(table.schema.get_field_index("text"), "text", text)
+    bomb = io.BytesIO()
+    pq.write_table(table, bomb, compression="zstd", store_schema=False)
+    path = tmp_path / "bomb.zip"
+    path.write_bytes(zipped(content | {"responses.parquet": bomb.getvalue()}))
+    assert path.stat().st_size < 1e6
+    started = time.process_time()
+    with raises(TrapsError, "release.submission._with_bounded_texts", str(path), "responses.parquet", str(size)):
+        read_submission(path)
+    assert time.process_time() - started < 2
+
+
 def test_submissions_of_the_same_items_and_panel_are_ranked_together(
     packed: Path, one_regime: Checkout, tmp_path: Path
 ) -> None:
@@ -309,7 +339,7 @@ def odd_value(value: object) -> object:
 @pytest.mark.parametrize("name", ["items", "responses", "votes", "metrics", "leaderboard"])
 def test_every_column_of_a_table_is_recomputed_or_named_as_not_recomputed(packed: Path, name: str) -> None:
     submission, table = read_submission(packed), TABLES[f"{name}.parquet"]
-    rows, unseen = records(submission.table(table)), list[str]()
+    rows, unseen = records(submission.read_table(table)), list[str]()
     for column in set(table.names) - {"labels", "created_at"}:
         at = next((k for k, row in enumerate(rows) if row[column] is not None), None)
         if at is None:

@@ -96,7 +96,7 @@ def broken(tmp_path_factory):
             for d in (*DATASETS, "overall")
         )
     )
-    overall = {"dataset": "overall", "figure": "pecs", "left_model": SPEAKS, "separable": False}
+    overall = {"dataset": "overall", "metric": "pecs", "left_model": SPEAKS, "separable": False}
     guided, standard = ({"left_regime": r, "right_regime": r, "right_model": THINKS} for r in ("guided", "standard"))
     regimes = {"left_regime": "standard", "right_regime": "guided", "right_model": SPEAKS}
     contrasts = [
@@ -219,7 +219,7 @@ def test_every_published_table_is_well_formed_in_every_medium():
         width = 1 if table.absence else len(table.columns)
         assert files[f"{table.name}.tex"].isascii()  # else pdflatex stops at the sign
         assert {len(row) for row in latex_cells(files[f"{table.name}.tex"].decode())} == {width}
-        assert len(pd.read_parquet(io.BytesIO(files[f"{table.name}.parquet"]))) == len(table.rows)
+        assert len(pd.read_csv(io.BytesIO(files[f"{table.name}.csv"]))) == len(table.rows)
         assert not re.search(r"\bnan\b|<NA>", files[f"{table.name}.md"].decode())
 
 
@@ -365,7 +365,7 @@ def test_export_writes_everything_with_an_index(workspace, tmp_path, monkeypatch
     monkeypatch.setattr(publish, "TABLE_REPORTS", TABLE_REPORTS[:2])
     assert main(["results", "export", str(tmp_path), "--workspace", str(workspace.root)]) == 0
     files = {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()}
-    assert {f"tables/published/overall.{kind}" for kind in ("csv", "md", "parquet", "tex")} <= files
+    assert {f"tables/published/overall.{kind}" for kind in ("csv", "md", "tex")} <= files
     assert {file for file in files if "doubt" in file} == {
         f"figures/published/doubt_conversion.{kind}" for kind in ("pdf", "svg", "png")
     }

@@ -68,8 +68,8 @@ def test_a_metric_declared_once_is_on_the_board_with_its_interval_in_the_legend_
     assert shown["Balanced"] == "0.700"  # Acc 4/5, AbsRec 3/5
     assert "**Balanced**: mean of Acc and AbsRec" in (tmp_path / "board.md").read_text()
     study = json.loads((tmp_path / "site/data/study.js").read_text().split(",", 2)[2].removesuffix(");\n"))
-    assert {"field": "balanced", "title": "Balanced", "unit": "fraction", "in_paper": False} in study["figures"]
-    assert {each["field"] for each in study["figures"] if each["in_paper"]} == {"pecs", "acc", "abs_rec", "false_abs"}
+    assert {"field": "balanced", "title": "Balanced", "unit": "fraction", "in_paper": False} in study["metrics"]
+    assert {each["field"] for each in study["metrics"] if each["in_paper"]} == {"pecs", "acc", "abs_rec", "false_abs"}
     (overall,) = (row for row in study["leaderboard"] if row["dataset"] == "overall")
     assert overall["balanced"] == pytest.approx(0.7) and overall["balanced_std"] == 0
     assert 0.2 < overall["balanced_ci_low"] < 0.7 < overall["balanced_ci_high"] < 1

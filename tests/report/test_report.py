@@ -146,6 +146,8 @@ def test_a_board_of_which_a_fifth_is_missing_says_first_why_and_what_to_change()
     assert leaderboard_text(board_of(a_fifth)).startswith("Occlusion. ")
     more = board_of(a_fifth | {"n_missing": 9, "n_errors": 1})
     assert leaderboard_text(more).startswith("m: 8 of 30 answers were undecided by the panel, 1 not given")
+    held_out = board_of(a_fifth | {"n_items": 15, "n_missing": 4, "n_errors": 4})  # one item of each pair
+    assert leaderboard_text(held_out).startswith("m: 4 of 15 answers were not given")
 
 
 def test_marks_and_columns_are_away_where_nothing_calls_for_them():

@@ -1,4 +1,4 @@
-"""Figures of two events on the printed leaderboard, in their own table and among the findings."""
+"""Metrics of two events on the printed leaderboard, in their own table and among the findings."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def test_without_two_events_the_leaderboard_is_what_it_was_byte_for_byte(rows: p
     assert not [text for text in before if any(heading in text for heading in HEADINGS)]
 
 
-def test_an_entry_that_was_asked_has_its_figures_and_another_a_dash(rows: pd.DataFrame) -> None:
+def test_an_entry_that_was_asked_has_its_metrics_and_another_a_dash(rows: pd.DataFrame) -> None:
     assert [_columns(rows)[heading] for heading in HEADINGS] == [["–", "75.0"], ["–", "0.75"]]
     assert all("0.75" in text for text in shown(rows))
 
 
-def test_figures_of_two_campaigns_are_dashes_with_the_reason(rows: pd.DataFrame) -> None:
+def test_metrics_of_two_campaigns_are_dashes_with_the_reason(rows: pd.DataFrame) -> None:
     verdicts = [lane_verdicts(reader, 2, model="asked"), lane_verdicts(reader, 2, model="asked", run=2, epoch="e2")]
     refused = two_way(pd.concat(verdicts, ignore_index=True), 20)
     assert [_columns(refused)[heading] for heading in HEADINGS] == [["–", "–"]] * 2

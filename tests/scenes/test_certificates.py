@@ -430,7 +430,7 @@ def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_
     assert "looks down by" in failures(race, race.spec)["level"]
     (lost,) = unanswerable_controls([race.spec])
     assert lost.startswith("hidden_race-0001: level: ") and "elevation_deg" in lost
-    assert "| `level` | the camera looks straight ahead |  | `elevation_deg` |" in certificates.table()
+    assert "| `level` | the camera looks straight ahead |  | `elevation_deg` |" in certificates.certificate_table()
 
 
 def test_the_page_of_scenes_names_every_certificate() -> None:

@@ -44,7 +44,7 @@ def test_every_variation_that_can_be_asked_is_defined_and_asks_its_sides():
 
 
 def test_the_page_has_the_table_of_variations():
-    assert ON_PAGE.written() == variations.table() + "\n"
+    assert ON_PAGE.written() == variations.variation_table() + "\n"
 
 
 # --- the asking -------------------------------------------------------------------------------------------------------

@@ -59,7 +59,7 @@ def test_uplift_is_the_ratio_of_means_not_the_mean_of_ratios():
     assert uplift(from_nothing)["ratio"].tolist() == [np.inf]
 
 
-def test_a_mean_of_which_a_dataset_has_no_figure_is_null_and_so_is_what_is_made_of_it():
+def test_a_mean_of_which_a_dataset_has_no_metric_is_null_and_so_is_what_is_made_of_it():
     # In one dataset every void of the standard regime went unanswered: the other three are no mean over the four.
     rates = {"standard": (0.2, 0.2, np.nan, 0.9), "guided": (0.4, 0.4, 0.4, 0.9)}
     frame = cells(
@@ -119,7 +119,7 @@ def test_reasoning_pairs_subtract_the_other_from_the_thinking_member():
     )
 
 
-def test_a_figure_that_one_member_lacks_has_no_difference():
+def test_a_metric_that_one_member_lacks_has_no_difference():
     frame = cells(
         *(cell(m, d, acc=np.nan if (m, d) == ("qwen3-vl-think", "chaotic") else 0.5)
           for m in ("qwen3-vl-think", "qwen3-vl-instruct") for d in DATASETS)

@@ -1,4 +1,4 @@
-"""Arms enter no figure of the pairs, and have figures of their own."""
+"""Arms enter no metric of the pairs, and have metrics of their own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from traps_pipeline.protocol.datasets import ARMS, DATASETS
 from traps_pipeline.protocol.ratings import VOTE_COLUMNS
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.scoring import bootstrap
-from traps_pipeline.scoring.metrics import cell_metrics, wrong_figures
+from traps_pipeline.scoring.metrics import cell_metrics, wrong_metrics
 from traps_pipeline.scoring.score_rows import CONTRASTS
 from traps_pipeline.storage.parquet import StageOutput
 from traps_pipeline.storage.study import Study
@@ -24,7 +24,7 @@ from traps_pipeline.storage.workspace import Workspace
 MODELS = {"oracle": (True, False, True), "prior": (True, True, False)}
 
 
-def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
+def metrics(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
     """Every table of figures over the pairs, and every frame that tables and figures of the report are made from."""
     made: dict[str, StageOutput] = {"contrasts": scoring_stages.contrasts.make(workspace, None)}
     workspace.tables.write(CONTRASTS, {}, made["contrasts"].frame, {})
@@ -38,7 +38,7 @@ def figures(workspace: Workspace) -> Mapping[str, pd.DataFrame]:
 
 @pytest.mark.slow
 @pytest.mark.promise
-def test_rows_of_arms_beside_the_pairs_change_no_figure(
+def test_rows_of_arms_beside_the_pairs_change_no_metric(
     rows: Rows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bootstrap.resample, "__defaults__", (50, bootstrap.SEED))
@@ -52,7 +52,7 @@ def test_rows_of_arms_beside_the_pairs_change_no_figure(
     alone, beside = (Workspace.create(tmp_path / name, study) for name in ("alone", "beside"))
     write(alone, pd.concat(pairs, ignore_index=True))
     write(beside, pd.concat([*pairs, *arms], ignore_index=True))
-    expected, found = figures(alone), figures(beside)
+    expected, found = metrics(alone), metrics(beside)
     assert len(expected["leaderboard"]) == 4 * 5
     for name, frame in expected.items():
         pd.testing.assert_frame_equal(found[name], frame, obj=name)
@@ -66,7 +66,7 @@ def test_rows_of_arms_beside_the_pairs_change_no_figure(
         ("labels_two", 0.5, 0.5, 1.0, 2),
     ],
 )
-def test_an_arm_has_the_figures_of_the_sides_that_it_has(
+def test_an_arm_has_the_metrics_of_the_sides_that_it_has(
     rows: Rows, arm: str, acc: float, false_abs: float, abs_rec: float, missing: int
 ) -> None:
     cells = cell_metrics(of_arm(rows, arm, [(True, False, True), (False, True, True), (None, None, None)]))
@@ -74,4 +74,4 @@ def test_an_arm_has_the_figures_of_the_sides_that_it_has(
     np.testing.assert_equal([one.acc, one.false_abs, one.abs_rec], [acc, false_abs, abs_rec])
     assert (one.n_pairs, one.n_missing) == (3, missing)
     assert np.isnan(one.pecs) == (arm != "labels_two")
-    assert wrong_figures(cells) == 0
+    assert wrong_metrics(cells) == 0

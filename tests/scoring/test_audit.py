@@ -82,7 +82,7 @@ def test_the_overall_table_follows_from_the_cells_but_for_one(findings):
 def test_the_cell_behind_it_is_the_only_one_whose_factors_do_not_give_its_pecs(findings):
     factors = findings[(findings["group"] == "pecs factors") & (findings["verdict"] == "differs")]
     assert list(factors["statement"]) == ["PECS of llava-next-video-7b, chaotic, json"]
-    # With Acc x J of its factors in its place the overall figure is the printed one.
+    # With Acc x J of its factors in its place the overall metric is the printed one.
     assert round((0.013 + 0.013 + 0.244 * (0.098 - 0.021) + 0.056) / 4, 3) == 0.025
 
 

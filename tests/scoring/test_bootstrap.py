@@ -92,7 +92,7 @@ def test_scenarios_of_a_taxonomy_stay_together_in_both_of_its_datasets(rows):
     assert widths[1] < 0.5 * widths[0]
 
 
-def test_an_interval_contains_the_figure_that_it_is_of():
+def test_an_interval_contains_the_metric_that_it_is_of():
     ends = np.array([[0.4, 0.5, 0.6], [0.5, 0.6, 0.7]])
     assert bootstrap.interval(ends, 0.95, (0.0, 1.0)).tolist() == pytest.approx([0.405, 0.95])
     assert bootstrap.interval(ends - 0.5, 0.0, (0.0, 1.0)).tolist() == pytest.approx([0.0, 0.195])

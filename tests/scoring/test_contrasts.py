@@ -61,7 +61,7 @@ def test_a_paired_contrast_takes_out_what_the_scenarios_share(rows):
     # m and n are wrong on the same scenarios but for thirty: the difference hardly varies, however wide each one is.
     m, n = pairs_with(300, 180, 0, 300), pairs_with(300, 150, 0, 300)
     _, resampled, table = scored(rows(m, model="m"), rows(n, model="n"))
-    row = only(table, kind="models", dataset="occlusion", figure="pecs")
+    row = only(table, kind="models", dataset="occlusion", metric="pecs")
     assert row["difference"] == pytest.approx(0.10)
     each = intervals(resampled).set_index(["dataset", "model"]).loc["occlusion"]
     assert (
@@ -81,7 +81,7 @@ def test_no_p_is_below_that_of_a_sign_flip_over_all_scenarios(n, rows):
         for d in ("occlusion", "occlusion_ill_posed")
         for m, pair in (("m", (True, False, True)), ("n", (False, True, False)))
     ]
-    table = scored(*parts, resamples=2000)[2].query("figure == 'j'")
+    table = scored(*parts, resamples=2000)[2].query("metric == 'j'")
     assert (table["p"] >= 2.0 ** (1 - n)).all()
     assert table["separable"].isna().all() == (2.0 ** (1 - n) >= 0.05)
 
@@ -90,7 +90,7 @@ def test_p_counts_the_resamples_on_the_other_side_and_adds_one(rows):
     # Of nine resamples k > 0 lie beyond 0: p is 2 (k + 1) / 10, and not 2 k / 9.
     better, worse = pairs_with(40, 20, 0, 40), pairs_with(40, 15, 0, 40)
     table = scored(rows(better, model="m"), rows(worse[::-1], model="n"), resamples=9)[2]
-    p = only(table, kind="models", dataset="occlusion", figure="pecs")["p"]
+    p = only(table, kind="models", dataset="occlusion", metric="pecs")["p"]
     assert p < 1
     assert 5 * p == pytest.approx(round(5 * p))
 
@@ -100,7 +100,7 @@ def test_two_scenarios_are_too_few_and_their_ranks_stay_open(rows):
     parts = [rows(pairs, dataset=d, model=m) for d in DATASETS for m, pairs in (("m", right), ("n", wrong))]
     metrics, resampled, table = scored(*parts)
     assert table["separable"].isna().all()
-    assert only(table, dataset="overall", figure="pecs")["n_scenarios"] == 4
+    assert only(table, dataset="overall", metric="pecs")["n_scenarios"] == 4
     board = leaderboard(metrics, intervals(resampled), table)
     assert board["rank_high"].eq(2).all() and board["rank_low"].eq(1).all()
 
@@ -117,9 +117,9 @@ def test_twenty_three_models_that_lie_well_apart_are_all_told_apart(rows):
     # 253 pairs: 2 / (resamples + 1), the least that counting can say, times 253 would be above 0.05 even for 10,000.
     parts = [rows(pairs_with(460, 20 * k, 0, 460), model=f"m{k:02d}") for k in range(23)]
     metrics, resampled, table = scored(*parts, resamples=200)
-    pecs = table[(table["kind"] == "models") & (table["figure"] == "pecs")]
+    pecs = table[(table["kind"] == "models") & (table["metric"] == "pecs")]
     assert (len(pecs), int(pecs["separable"].sum())) == (253, 253)
-    assert not table.loc[table["figure"] == "j", "separable"].any()  # J is 1 of all of them
+    assert not table.loc[table["metric"] == "j", "separable"].any()  # J is 1 of all of them
     board = leaderboard(metrics, intervals(resampled), table)
     assert (board["rank_low"] == board["rank_high"]).all()
 
@@ -136,7 +136,7 @@ def test_reference_rows_are_ranked_among_themselves(rows):
 def test_equal_models_are_not_separable_and_share_all_ranks(rows):
     same = pairs_with(40, 30, 2, 20)
     metrics, resampled, table = scored(rows(same, model="m"), rows(same, model="n"))
-    assert only(table, dataset="occlusion", figure="pecs")["p"] == 1.0
+    assert only(table, dataset="occlusion", metric="pecs")["p"] == 1.0
     board = leaderboard(metrics, intervals(resampled), table)
     assert board[["rank", "rank_low", "rank_high"]].values.tolist() == [[1, 1, 2], [1, 1, 2]]
 
@@ -157,13 +157,13 @@ def test_regimes_of_a_model_are_contrasted_on_each_dataset_and_overall(rows):
         for r, k in (("standard", 5), ("guided", 15))
     ]
     table = scored(*parts)[2]
-    regimes = table[(table["kind"] == "regimes") & (table["figure"] == "j")]
+    regimes = table[(table["kind"] == "regimes") & (table["metric"] == "j")]
     assert list(regimes["dataset"]) == [*DATASETS, "overall"]
     assert regimes["difference"].tolist() == pytest.approx([-0.5] * 5)
     assert set(zip(regimes["left_regime"], regimes["right_regime"], strict=True)) == {("standard", "guided")}
 
 
-def test_a_contrast_across_epochs_is_refused_with_the_reason_and_no_figure(rows):
+def test_a_contrast_across_epochs_is_refused_with_the_reason_and_no_metric(rows):
     pairs = pairs_with(10, 5, 0, 5)
     parts = [
         rows(pairs, dataset=d, model=m, epoch="new" if (m, d) == ("n", "chaotic") else "old")
@@ -226,7 +226,7 @@ def test_an_entry_without_all_four_datasets_is_in_no_overall_contrast(rows):
     assert table["refused"].isna().all()
     overall = table[table["dataset"] == "overall"]
     assert set(overall["left_model"]) | set(overall["right_model"]) == {"m", "n"}
-    assert len(table[(table["dataset"] == "occlusion") & (table["figure"] == "j")]) == 3
+    assert len(table[(table["dataset"] == "occlusion") & (table["metric"] == "j")]) == 3
 
 
 def test_holms_correction_is_the_textbooks_and_statsmodels():
@@ -263,7 +263,7 @@ def test_holm_counts_the_pairs_of_regimes_of_all_models_together_and_models_with
     parts = [
         rows(pairs_with(90, 30 + 9 * k, 1, 60), model=model, regime=regime) for k, (model, regime) in enumerate(sides)
     ]
-    table = scored(*parts)[2].query("dataset == 'occlusion' and figure == 'pecs'")
+    table = scored(*parts)[2].query("dataset == 'occlusion' and metric == 'pecs'")
     for _, family in [
         ("", table.query("kind == 'regimes'")),  # three pairs of each of two models: six tests
         *table.query("kind == 'models'").groupby("left_regime"),
@@ -309,8 +309,8 @@ def coverage(acc, false_abs, abs_rec):
         sums = with_unseen(sums, np.full((len(sums), 3), scenarios), drawn.unseen("m", 3))
         ends = metrics_of(sums).reshape(2, 50, runs, len(RESAMPLED_METRICS), -1).mean(axis=2)
         for name, truth in (("j", true_j), ("pecs", acc * max(0.0, true_j))):
-            of_figure = np.moveaxis(ends[:, :, RESAMPLED_METRICS.index(name)], 0, 1)
-            bounds = interval(of_figure[..., 1:], of_figure[:, 1, 0], limits_of(name))
+            of_metric = np.moveaxis(ends[:, :, RESAMPLED_METRICS.index(name)], 0, 1)
+            bounds = interval(of_metric[..., 1:], of_metric[:, 1, 0], limits_of(name))
             covered[name].append((bounds[:, 0] - 1e-9 <= truth) & (truth <= bounds[:, 1] + 1e-9))
     return {name: float(np.concatenate(parts).mean()) for name, parts in covered.items()}
 
@@ -324,7 +324,7 @@ def test_versions_are_compared_on_what_both_hold(rows):
     pairs = pairs_with(40, 20, 0, 20)
     then = pd.concat([rows(pairs), rows(pairs, run=2)], ignore_index=True)
     now = rows([(True, False, True)] * 30, run=1)  # ten scenarios were discarded, one run was made again
-    row = only(version_contrasts(then, now, resamples=200), dataset="occlusion", figure="pecs")
+    row = only(version_contrasts(then, now, resamples=200), dataset="occlusion", metric="pecs")
     assert (row["n_pairs"], row["now"]) == (30, 1.0)
     assert row["then"] == pytest.approx((20 / 30) ** 2)
     assert row["difference"] == pytest.approx(1 - (20 / 30) ** 2)
@@ -333,16 +333,16 @@ def test_versions_are_compared_on_what_both_hold(rows):
 def test_the_interval_between_versions_is_that_of_the_difference_on_the_same_resamples(rows):
     pairs = pairs_with(40, 20, 0, 20)
     then = rows(pairs)
-    same = only(version_contrasts(then, then, resamples=200), figure="pecs")
+    same = only(version_contrasts(then, then, resamples=200), metric="pecs")
     assert same["difference"] == 0 and same["ci_low"] < 0 < same["ci_high"] and same["p"] == 1.0
     assert not same["separable"]
     with raises(TrapsError, "scoring.contrasts.version_contrasts"):
         version_contrasts(then, rows(pairs, model="other"))
     better = rows([(True, False, True)] * 40)
     table = version_contrasts(then, better, resamples=200)
-    row = only(table, figure="pecs")
+    row = only(table, metric="pecs")
     assert 0 < row["ci_low"] <= row["difference"] <= row["ci_high"] <= 1
-    assert (table["p_holm"] >= table["p"]).all()  # adjusted over the models of a figure: here there is one
+    assert (table["p_holm"] >= table["p"]).all()  # adjusted over the models of a metric: here there is one
     assert row["p_holm"] == row["p"]
 
 
@@ -351,7 +351,7 @@ def test_versions_of_different_epochs_are_refused_row_by_row(rows):
     then = pd.concat([rows(pairs), rows(pairs, dataset="chaotic")], ignore_index=True)
     now = pd.concat([rows(pairs), rows(pairs, dataset="chaotic", epoch="e2")], ignore_index=True)
     table = version_contrasts(then, now.assign(benchmark_version="v2"), resamples=20)
-    fine, refused = only(table, dataset="occlusion", figure="j"), only(table, dataset="chaotic", figure="j")
+    fine, refused = only(table, dataset="occlusion", metric="j"), only(table, dataset="chaotic", metric="j")
     assert fine["difference"] == 0
     assert pd.isna(fine["refused"])
     assert names(refused["refused"]) == "chaotic chaotic:s0:control 19 e1 e2"
@@ -365,7 +365,7 @@ def test_versions_are_compared_on_whole_pairs_and_say_what_is_missing(rows):
     then = rows([(True, False, True)] * 4)
     now = rows([(True, False, True), (True, False, None), (True, False, True), (True, False, True)])
     now = now[now["item_id"] != "occlusion:s3:void"]
-    row = only(version_contrasts(then, now, resamples=20), figure="j")
+    row = only(version_contrasts(then, now, resamples=20), metric="j")
     assert (row["n_pairs"], row["n_missing_then"], row["n_missing_now"]) == (3, 0, 1)
 
 

@@ -1,4 +1,4 @@
-"""Graded cuts: what decisions and stated probabilities come to, against figures worked out by hand."""
+"""Graded cuts: what decisions and stated probabilities come to, against metrics worked out by hand."""
 
 from __future__ import annotations
 

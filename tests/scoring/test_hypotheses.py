@@ -1,4 +1,4 @@
-"""Doses of a hypothesis: figures by hand, changes on shared scenarios, rules beside them, no part of the pairs'."""
+"""Doses of a hypothesis: metrics by hand, changes on shared scenarios, rules beside them, no part of the pairs'."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def test_overall_weighs_datasets_equally_within_each_run(rows):
     ]
     row = entry(board_of(pd.concat(parts, ignore_index=True)), "overall")
     assert (row.pecs, row.pecs_std) == (0.5, 0.25)
-    assert (row.n_pairs, row.n_runs) == (2 + 2 + 5 + 2, 2)
+    assert (row.n_pairs, row.n_items, row.n_runs) == (2 + 2 + 5 + 2, 22, 2)
     assert row.pecs_ci_low <= 0.5 <= row.pecs_ci_high
 
 
@@ -129,7 +129,7 @@ def test_models_of_two_panels_are_neither_ranked_nor_contrasted_together_and_a_m
     assert board["rank"].astype("object").where(board["rank"].notna(), None).to_dict() == {
         "a": 1, "b": 2, "c": 1, "d": None,
     }  # fmt: skip
-    of_j = table.loc[table["figure"] == "j"].to_dict("records")
+    of_j = table.loc[table["metric"] == "j"].to_dict("records")
     refused = {(row["left_model"], row["right_model"]): row["refused"] for row in of_j}
     assert {pair for pair, why in refused.items() if pd.isna(why)} == {("a", "b")}
     assert -1 < refused["a", "c"].find("one@1") < refused["a", "c"].find("two@1")  # left, right
@@ -145,14 +145,8 @@ def test_an_entry_is_incomplete_below_99_percent_answered(lost, incomplete, rows
 def test_an_entry_that_answered_every_item_of_a_held_out_set_is_complete(rows):
     verdicts = rows([(True, False, True)] * 4).iloc[[0, 3, 4, 7]]  # one side of each pair
     row = entry(board_of(verdicts))
-    assert (row.n_pairs, row.n_missing, row.answered, row.incomplete, row.pecs, row["rank"]) == (
-        4,
-        0,
-        1.0,
-        False,
-        1.0,
-        1,
-    )
+    assert (row.n_pairs, row.n_items, row.n_missing, row.answered, row.incomplete) == (4, 4, 0, 1.0, False)
+    assert (row.pecs, row["rank"]) == (1.0, 1)
 
 
 def test_an_item_without_a_majority_is_answered_all_the_same(rows):
@@ -212,12 +206,12 @@ def test_nothing_scored_gives_an_empty_board(rows, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("figure", "low", "wrong"), [("pecs", -0.1, 1), ("j", -0.1, 0), ("j", -1.1, 1), ("acc", 0.0, 0)]
+    ("metric", "low", "wrong"), [("pecs", -0.1, 1), ("j", -0.1, 0), ("j", -1.1, 1), ("acc", 0.0, 0)]
 )
-def test_intervals_out_of_order_or_range_are_counted(figure, low, wrong, rows):
+def test_intervals_out_of_order_or_range_are_counted(metric, low, wrong, rows):
     board = board_of(rows([(True, False, True), (True, False, False), (True, False, True)])).head(1)
     assert wrong_intervals(board) == 0
-    assert wrong_intervals(board.assign(**{f"{figure}_ci_low": low})) == wrong
-    assert wrong_intervals(board.assign(**{f"{figure}_ci_high": 1.1})) == 1
-    assert wrong_intervals(board.assign(**{f"{figure}_ci_low": 0.6, f"{figure}_ci_high": 0.4})) == 1
-    assert wrong_intervals(board.assign(**{f"{figure}_ci_low": np.nan, f"{figure}_ci_high": np.nan})) == 0
+    assert wrong_intervals(board.assign(**{f"{metric}_ci_low": low})) == wrong
+    assert wrong_intervals(board.assign(**{f"{metric}_ci_high": 1.1})) == 1
+    assert wrong_intervals(board.assign(**{f"{metric}_ci_low": 0.6, f"{metric}_ci_high": 0.4})) == 1
+    assert wrong_intervals(board.assign(**{f"{metric}_ci_low": np.nan, f"{metric}_ci_high": np.nan})) == 0

@@ -1,4 +1,4 @@
-"""Figures of a cell against numbers worked out by hand (docs/spec.md 5.1)."""
+"""Metrics of a cell against numbers worked out by hand (docs/spec.md 5.1)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from tests.build.errors import raises
 from traps_pipeline.judging.judging_rows import VERDICTS
-from traps_pipeline.scoring.metrics import BOUNDS, CELL_METRICS, cell_metrics, wrong_figures
+from traps_pipeline.scoring.metrics import BOUNDS, CELL_METRICS, cell_metrics, wrong_metrics
 from traps_pipeline.scoring.score_rows import LEADERBOARD, METRICS
 from traps_pipeline.storage.parquet import TableStore
 
@@ -21,18 +21,18 @@ def one(metrics: pd.DataFrame, **equal: object) -> pd.Series:
     return metrics.iloc[0]
 
 
-def test_every_figure_of_a_cell_is_a_column_of_its_table_and_of_the_leaderboard():
+def test_every_metric_of_a_cell_is_a_column_of_its_table_and_of_the_leaderboard():
     assert {*CELL_METRICS} <= {*METRICS.names} & {*LEADERBOARD.names}
 
 
-def test_figures_follow_their_definitions(rows):
+def test_metrics_follow_their_definitions(rows):
     # Five pairs: controls right 4/5, abstained on 1/5; voids abstained on 3/5.
     pairs = [(True, False, True), (True, False, True), (True, True, True), (True, False, False), (False, False, False)]
     cell = one(cell_metrics(rows(pairs)), scope="all")
     assert (cell.n_pairs, cell.n_missing) == (5, 0)
     # J = 0.6 - 0.2 = 0.4; PECS = 0.8 x 0.4 = 0.32; Naive = 0.8 x 0.6 = 0.48
-    figures = {"acc": 0.8, "abs_rec": 0.6, "false_abs": 0.2, "j": 0.4, "pecs": 0.32, "naive": 0.48}
-    assert {name: cell[name] for name in CELL_METRICS} == pytest.approx(figures)
+    metrics = {"acc": 0.8, "abs_rec": 0.6, "false_abs": 0.2, "j": 0.4, "pecs": 0.32, "naive": 0.48}
+    assert {name: cell[name] for name in CELL_METRICS} == pytest.approx(metrics)
     assert (cell.epoch, cell.benchmark_version) == ("e1", "v1")
 
 
@@ -130,13 +130,13 @@ SOUND = {"acc": 0.8, "abs_rec": 0.75, "false_abs": 0.25, "pecs": 0.4, "pecs_low"
         ({"acc": 1.5, "pecs": 0.9, "pecs_low": 0.7, "pecs_high": 0.6}, 3),  # a share, its bounds, the product
     ],
 )
-def test_each_wrong_figure_of_a_cell_is_counted_once(altered, wrong):
+def test_each_wrong_metric_of_a_cell_is_counted_once(altered, wrong):
     assert [name for name in SOUND if name.startswith("pecs_")] == BOUNDS
-    assert wrong_figures(pd.DataFrame([SOUND | altered])) == wrong
-    assert wrong_figures(pd.DataFrame([SOUND, SOUND | altered])) == wrong
+    assert wrong_metrics(pd.DataFrame([SOUND | altered])) == wrong
+    assert wrong_metrics(pd.DataFrame([SOUND, SOUND | altered])) == wrong
 
 
-def test_an_empty_denominator_makes_a_figure_null_and_what_depends_on_it(rows):
+def test_an_empty_denominator_makes_a_metric_null_and_what_depends_on_it(rows):
     cell = one(cell_metrics(rows([(True, False, None), (False, False, None)])), scope="all")
     assert (cell.acc, cell.false_abs) == (0.5, 0.0)
     assert cell[["abs_rec", "j", "pecs", "naive"]].isna().all()

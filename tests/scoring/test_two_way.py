@@ -1,4 +1,4 @@
-"""Figures of two events by hand, and what rules earn that look at one thing alone."""
+"""Metrics of two events by hand, and what rules earn that look at one thing alone."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def only(verdicts: pd.DataFrame) -> Any:
     return table.iloc[0]
 
 
-def figures(row: Any) -> list[float]:
+def metrics(row: Any) -> list[float]:
     return [row[name] for name in LOWEST]
 
 
@@ -48,7 +48,7 @@ def figures(row: Any) -> list[float]:
 )
 def test_a_rule_has_the_effects_of_what_it_looks_at(rule: Rule, expected: list[float], abstained: list[float]) -> None:
     row = only(lane_verdicts(rule))
-    assert figures(row) == pytest.approx(expected)
+    assert metrics(row) == pytest.approx(expected)
     assert [row[name] for name in CELLS] == pytest.approx(abstained)
     assert (row.n_scenarios, row.n_items, row.n_missing) == (20, 160, 0)
 
@@ -79,7 +79,7 @@ def test_one_wrong_answer_costs_its_scenario_and_no_effect() -> None:
     answered = int(np.flatnonzero(verdicts["side"] == "control")[0])
     verdicts.loc[answered, "correct"] = False
     row = only(verdicts)
-    assert figures(row) == pytest.approx([19 / 20, 1, 0, 1])
+    assert metrics(row) == pytest.approx([19 / 20, 1, 0, 1])
     assert row.acc == pytest.approx(79 / 80)
     # A right answer with an abstention is none.
     verdicts.loc[answered, ["correct", "abstained"]] = True
@@ -104,13 +104,13 @@ def test_one_item_of_each_scenario_gives_effects_and_no_conjunction() -> None:
     assert (row.n_scenarios, row.n_items, row.own_effect, row.other_effect) == (16, 16, 1, 0)
     assert np.isnan([row.conjunction, row.conjunction_ci_low]).all()
     alone = only(verdicts.iloc[:1])
-    assert np.isnan([*figures(alone), alone.specificity_ci_low]).all() and (alone.abstains_neither, alone.acc) == (0, 1)
+    assert np.isnan([*metrics(alone), alone.specificity_ci_low]).all() and (alone.abstains_neither, alone.acc) == (0, 1)
 
 
 def test_runs_are_averaged() -> None:
     runs = [lane_verdicts(reader, 4, run=1), lane_verdicts(lambda item: True, 4, run=2)]
     row = only(pd.concat(runs, ignore_index=True))
-    assert (row.n_runs, *figures(row)) == (2, 1 / 2, 1 / 2, 0, 1 / 2)
+    assert (row.n_runs, *metrics(row)) == (2, 1 / 2, 1 / 2, 0, 1 / 2)
     assert row.acc == 1 / 2
 
 
@@ -149,11 +149,11 @@ def test_a_harness_scores_two_events_as_the_table_does() -> None:
         for each in wrong.assign(outcome="answer").to_dict("records")
     )
     assert (row.conjunction, row.own_effect) == (1 / 2, 2 / 3)  # right, answered, undecided
-    assert [found[name] for name in LOWEST] == pytest.approx(figures(row))
+    assert [found[name] for name in LOWEST] == pytest.approx(metrics(row))
     assert (found["pecs"], found["missing"]) == (None, 1)
 
 
-def test_a_figure_beyond_its_limits_is_counted() -> None:
+def test_a_metric_beyond_its_limits_is_counted() -> None:
     table = two_way(lane_verdicts(reader, 2), 20)
     assert wrong_rows(table.assign(specificity=1.1)) == wrong_rows(table.assign(abstains_both=-0.1)) == 1
     assert len(lane_items("hidden_drop-e000")) == 8

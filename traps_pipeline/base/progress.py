@@ -1,7 +1,7 @@
 """Hold the state of a run, and the events that change it.
 
 Library code reports to `current()`. A command installs a subclass that prints (`cli/printed_progress.py`), and a
-Dagster step adds a listener (`Progress.heard_by`).
+Dagster step adds a listener (`Progress.reporting_to`).
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Traffic:
         ordered = sorted(self.latencies)
         return ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0
 
-    def figures(self) -> dict[str, float]:
-        """Return the figures by name, for a line of JSON."""
+    def state(self) -> dict[str, float]:
+        """Return counts and times by name, for a line of JSON."""
         counts = {name: getattr(self, name) for name in ("done", "wanted", "cached", "errors", "retries")}
         counts["in_flight"] = len(self.sent_at)
         pace = {"oldest_s": self.oldest_s, "per_second": self.per_second}
@@ -237,7 +237,7 @@ class Progress:
     # --- state --------------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def heard_by(self, listener: Callable[[str], None]) -> Iterator[None]:
+    def reporting_to(self, listener: Callable[[str], None]) -> Iterator[None]:
         """Call a listener with a progress line, every 30 s and at a stage's end."""
         self._listeners.append(listener)
         try:
@@ -245,13 +245,13 @@ class Progress:
         finally:
             self._listeners.remove(listener)
 
-    def figures(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Return the state by name, for a line of JSON."""
         money = {"spent_usd": round(self.spent_usd, 6), "budget_usd": self.budget_usd}
         if (now := self.current_stage) is None:
             return money
         times = {"seconds": round(now.seconds, 1), "left_s": None if now.left_s is None else round(now.left_s, 1)}
-        calls = {participant: traffic.figures() for participant, traffic in [*now.calls.items()]}
+        calls = {participant: traffic.state() for participant, traffic in [*now.calls.items()]}
         counts = {"stage": now.name, "done": now.done, "partitions": now.partitions, "detail": now.detail}
         return {**counts, **times, **money, "calls": calls}
 

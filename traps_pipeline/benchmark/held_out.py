@@ -143,9 +143,10 @@ def begin_publication(study: Path, output: str) -> None:
             write_text(_of_user(PUBLISHED), output)
 
 
-def count_scoring(key: Path, answers: Path) -> int:
-    """Note a file of answers beside the key by which it was scored; return how many files were."""
+def count_scoring(key: Path, answers: Path, scores: int) -> int:
+    """Note a file's number of scores beside the key by which it was scored; return how many there are of all files."""
     note = key.with_name(f"{key.name}.scored")
-    digests = {file_digest(answers), *(note.read_text().split() if note.is_file() else ())}
-    write_text(note, "\n".join(sorted(digests)) + "\n", private=True)
-    return len(digests)
+    counts = dict(line.split() for line in note.read_text().splitlines()) if note.is_file() else {}
+    counts[file_digest(answers)] = str(scores)
+    write_text(note, "".join(f"{line}\n" for line in sorted(map(" ".join, counts.items()))), private=True)
+    return sum(map(int, counts.values()))

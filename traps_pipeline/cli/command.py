@@ -190,7 +190,7 @@ def _show_help(arguments: argparse.Namespace) -> int:
 
 
 def print_json(value: Any) -> None:
-    """Print a result as JSON, with null for missing figures."""
+    """Print a result as JSON, with null for missing numbers."""
     print(json.dumps(_as_json(value), indent=2, ensure_ascii=False, allow_nan=False))
 
 

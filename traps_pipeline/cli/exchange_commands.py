@@ -74,8 +74,8 @@ def import_given(arguments: argparse.Namespace) -> int:
     context = AnswerContext(arguments.model, arguments.run, arguments.key and held_out_key(arguments.key))
     import_result = import_answers(open_workspace(arguments), experiment, arguments.file, context, arguments.errors)
     if arguments.key:
-        count = count_noun(count_scoring(arguments.key, arguments.file), "file")
-        print(f"scored by this key: {count}; about 20 scores of one participant tell every side", file=sys.stderr)
+        count = count_noun(count_scoring(arguments.key, arguments.file, import_result.scores), "score")
+        print(f"by this key: {count}; about 20 of one participant tell every side", file=sys.stderr)
     return _print_import(import_result, arguments, "answer")
 
 

@@ -73,11 +73,11 @@ def move(arguments: argparse.Namespace) -> int:
     from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
     from traps_pipeline.storage.place import parse_place
-    from traps_pipeline.storage.store_move import move_to_store
+    from traps_pipeline.storage.several_hosts import several_hosts
     from traps_pipeline.storage.workspace import VARIABLE
 
     workspace = open_workspace(arguments)
     with use_progress(make_progress()):
-        count = move_to_store(workspace, parse_place(arguments.store))
+        count = several_hosts().move(workspace, parse_place(arguments.store))
     print(f"moved {count_noun(count, 'row')} to {arguments.store}; next: export {VARIABLE}={arguments.store}")
     return OK

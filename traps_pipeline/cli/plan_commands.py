@@ -175,7 +175,7 @@ def _print_local(costs: Sequence[Cost], card: str) -> None:
     rows = [
         (
             cost.model, cost.kind, f"{cost.passes:,}", f"{cost.tokens_in / 1e6:,.2f}, {cost.tokens_out / 1e6:,.2f}",
-            *("unknown" if figure is None else f"{figure:,.1f}" for figure in (cost.hours, cost.gigabytes)),
+            *("unknown" if number is None else f"{number:,.1f}" for number in (cost.hours, cost.gigabytes)),
         )
         for cost in costs
     ]  # fmt: skip

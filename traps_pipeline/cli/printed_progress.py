@@ -127,12 +127,12 @@ class JsonProgress(PrintedProgress):
     @override
     def stage(self, name: str, partitions: int) -> None:
         super().stage(name, partitions)
-        self._event("begin", self.figures())
+        self._event("begin", self.state())
 
     @override
     def end_stage(self) -> None:
         if self.current_stage is not None:
-            self._event("end", self.figures() | vars(self.current_stage.tally))
+            self._event("end", self.state() | vars(self.current_stage.tally))
         Progress.end_stage(self)
 
     @override
@@ -147,12 +147,12 @@ class JsonProgress(PrintedProgress):
         total = Tally()
         for tally in self.totals.values():
             total.add(tally)
-        self._event("finish", {"seconds": round(time.monotonic() - self._began, 1), **self.figures(), **vars(total)})
+        self._event("finish", {"seconds": round(time.monotonic() - self._began, 1), **self.state(), **vars(total)})
 
     @override
     def beat(self) -> None:
         if self.current_stage is not None:
-            self._event("progress", self.figures())
+            self._event("progress", self.state())
 
     def _event(self, name: str, values: dict[str, Any]) -> None:
         at = datetime.now(UTC).isoformat(timespec="seconds")

@@ -104,19 +104,19 @@ def compare_studies(arguments: argparse.Namespace) -> int:
     entries = dict.fromkeys((row["model"], row["regime"]) for row in changed)
     for model, regime in entries:
         cells = [_change(row) for row in changed if (row["model"], row["regime"]) == (model, regime)]
-        headings = ("dataset", "figure", "then", "now", "change", "95 % interval", "separable", "missing")
+        headings = ("dataset", "metric", "then", "now", "change", "95 % interval", "separable", "missing")
         print(f"{plain(model)}, {regime}\n{text_table(headings, cells, left=(0, 1))}\n")
     for reason in dict.fromkeys(row["refused"] for row in rows if row["refused"]):
         print(wrap_text(f"not compared: {plain(reason)}"))
     pairs = {(row["model"], row["regime"], row["dataset"]): row["n_pairs"] for row in rows}
     n_pairs = sum(count for (*_, dataset), count in pairs.items() if dataset != "overall")
-    differ = f"{len(changed)} of {count_noun(len(rows), 'figure')} differ on {count_noun(n_pairs, 'common pair')}"
+    differ = f"{len(changed)} of {count_noun(len(rows), 'metric')} differ on {count_noun(n_pairs, 'common pair')}"
     print(wrap_text(f"{differ}; --csv FILE and --json have all"))
     return OK
 
 
 def _differs(row: Mapping[Any, Any]) -> bool:
-    """Return whether a figure or the number of missing answers is another one now."""
+    """Return whether a metric or the number of missing answers is another one now."""
     pairs = [(row[f"{name}then"], row[f"{name}now"]) for name in ("", "n_missing_")]
     return any(then != now and not (then != then and now != now) for then, now in pairs)
 
@@ -124,11 +124,11 @@ def _differs(row: Mapping[Any, Any]) -> bool:
 def _change(row: Mapping[Any, Any]) -> list[str]:
     """Return a row of the printed table."""
 
-    def figure(name: str, sign: str = "") -> str:
+    def number(name: str, sign: str = "") -> str:
         return "-" if row[name] != row[name] else f"{row[name]:{sign}.3f}"
 
-    interval = "-" if row["ci_low"] != row["ci_low"] else f"[{figure('ci_low', '+')}, {figure('ci_high', '+')}]"
+    interval = "-" if row["ci_low"] != row["ci_low"] else f"[{number('ci_low', '+')}, {number('ci_high', '+')}]"
     separable = "-" if row["p"] != row["p"] else {True: "yes", False: "no"}.get(row["separable"], "too few")
     missing = [int(row[f"n_missing_{side}"]) for side in ("then", "now")]
-    figures = [figure("then"), figure("now"), figure("difference", "+"), interval]
-    return [row["dataset"], row["figure"], *figures, separable, "" if not any(missing) else "{} -> {}".format(*missing)]
+    numbers = [number("then"), number("now"), number("difference", "+"), interval]
+    return [row["dataset"], row["metric"], *numbers, separable, "" if not any(missing) else "{} -> {}".format(*missing)]

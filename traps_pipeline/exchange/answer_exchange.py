@@ -98,12 +98,16 @@ class Answer(BaseModel):
 
 @dataclass(frozen=True)
 class ImportResult:
-    """New answers, those already in the ledger, failed calls in words, and how many error messages were left out."""
+    """New answers, those already in the ledger, failed calls in words, and how many error messages were left out.
+
+    scores: models, regimes and runs that the file answers, each of which has a score of its own.
+    """
 
     new: int
     known: int
     failed: str = ""
     dropped: int = 0
+    scores: int = 1
 
 
 @dataclass(frozen=True)
@@ -244,7 +248,8 @@ def import_answers(
     ]
     new = asyncio.run(_store(workspace, workspace.answers, outcomes))
     failed = f"{count_noun(n_failed, 'sample')} of the log" if n_failed else ""
-    return ImportResult(new, len(answers) - new, failed, dropped=len(like_errors) if errors == "drop" else 0)
+    dropped, scores = len(like_errors) if errors == "drop" else 0, len({stored.evaluation for stored in outcomes})
+    return ImportResult(new, len(answers) - new, failed, dropped, scores)
 
 
 def export_request_batches(

@@ -379,5 +379,5 @@ def _join_outputs(parts: Sequence[StageOutput]) -> StageOutput:
     for later_part in other_parts:
         first.tally.add(later_part.tally)
     rows = [row for part in parts for row in part.content]
-    figures = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
-    return StageOutput(rows, first.tally, figures, first.beside)
+    shown = {name: round(sum(part.shown[name] for part in parts), 6) for name in first.shown}
+    return StageOutput(rows, first.tally, shown, first.beside)

@@ -134,14 +134,14 @@ class Database(ABC):
 
     @property
     @abstractmethod
-    def put_aside(self) -> str:
+    def restart_words(self) -> str:
         """The command or step, in words, by which a person starts anew in an empty database."""
 
     def damaged(self, what: str) -> TrapsError:
         """Return the error of a ledger that must not be written on, with the way to save it."""
         return TrapsError(
             f"{self.place}: {what}, so nothing is asked; `traps study export-ledger FILE` saves what is whole, then "
-            f"{self.put_aside}, and `traps study import-ledger FILE` brings it back"
+            f"{self.restart_words}, and `traps study import-ledger FILE` brings it back"
         )
 
     def sentence(self, error: Exception) -> TrapsError:

@@ -179,7 +179,7 @@ class SqliteDatabase(Database):
 
     @property
     @override
-    def put_aside(self) -> str:
+    def restart_words(self) -> str:
         return f"move {self.path}* away"
 
     @override

@@ -76,10 +76,10 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
             row_keys = dict(zip(keys, cast("tuple[str, ...]", key), strict=True))
             top = part["alpha"].max()
             ends = {"0": part.loc[part["alpha"] == 0], "top": part.loc[part["alpha"] == top]}
-            figures = {
+            metrics = {
                 f"{side}_{end}": means[side].mean() for side in ("control", "void") for end, means in ends.items()
             }
-            result.append({**row_keys, "path_set": path_set, "n_paths": len(ends["top"]), "alpha": top, **figures})
+            result.append({**row_keys, "path_set": path_set, "n_paths": len(ends["top"]), "alpha": top, **metrics})
     return pd.DataFrame(result, columns=pd.Index(REGIME_COLUMNS))
 
 

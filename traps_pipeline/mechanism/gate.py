@@ -189,7 +189,7 @@ class Outcomes:
         """Return outcomes after a gate (n,) bool; a gated undecided answer abstains."""
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """Return acc, false_abs, abs_rec and pecs; NaN where nothing was decided."""
         yes, n_decided = self.counts().sum(axis=0).reshape(3, 2).T
         with np.errstate(invalid="ignore"):

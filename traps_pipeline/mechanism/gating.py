@@ -191,29 +191,29 @@ def _rows(
     rows: list[GateRow] = []
     names = states.items["scenario_id"].to_numpy(str)
     for threshold in THRESHOLDS:
-        dataset_figures: list[dict[str, float]] = []
+        dataset_metrics: list[dict[str, float]] = []
         draws: list[np.ndarray] = []
         for target, (decisions, layer) in decided.items():
             outcome = outcomes[target]
             gate = decisions.score > decisions.threshold[threshold]
             gated_outcomes = outcome.gated(gate)
-            values = gated_outcomes.figures()
+            values = gated_outcomes.metrics()
             if target not in DATASETS:  # what the gate alone would do to items that must be answered
                 values = dict.fromkeys(values, np.nan)
                 values["false_abs"] = float(gate[~outcome.void].mean()) if (~outcome.void).any() else np.nan
-            values |= {f"plain_{name}": value for name, value in outcome.figures().items()}
+            values |= {f"plain_{name}": value for name, value in outcome.metrics().items()}
             values |= {"expected_false_abs": float(decisions.expected[threshold].mean())}
             about_pecs = interval(np.full((2, 1), np.nan), np.nan, (0.0, 1.0))
             if target in DATASETS:
                 sums = _resample(gated_outcomes, target, names[decisions.place], resamples, seed)
                 about_pecs = interval(metrics_of(sums)[:, _PECS, 1:], values["pecs"], (0.0, 1.0))
-                dataset_figures.append(values)
+                dataset_metrics.append(values)
                 draws.append(metrics_of(sums, in_mean=True)[:, _PECS, 1:])
             area = gate_auroc(decisions, outcome.void)
             sides = int((~outcome.void).sum()), int(outcome.void.sum())
             rows.append(_row(states, (*about, threshold, target), layer, area, values, about_pecs, sides))
-        if len(dataset_figures) == len(DATASETS):
-            means = {name: float(np.mean([scores[name] for scores in dataset_figures])) for name in dataset_figures[0]}
+        if len(dataset_metrics) == len(DATASETS):
+            means = {name: float(np.mean([scores[name] for scores in dataset_metrics])) for name in dataset_metrics[0]}
             sides = [
                 sum(getattr(r, name) for r in rows[-len(decided) :] if r.target in DATASETS)
                 for name in ("n_controls", "n_voids")
@@ -242,8 +242,8 @@ def _row(
     sides: tuple[int, int],
 ) -> GateRow:
     low, high = about_pecs
-    figures = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
+    metrics = {**values, "auroc": area, "pecs_low": float(low), "pecs_high": float(high)}
     row_keys: dict[str, Any] = dict(zip(("features", "regime", "source", "threshold", "target"), about, strict=True))
     return GateRow(
-        **states.joined, **row_keys, **nan_to_null(figures), layer=layer, n_controls=sides[0], n_voids=sides[1]
+        **states.joined, **row_keys, **nan_to_null(metrics), layer=layer, n_controls=sides[0], n_voids=sides[1]
     )

@@ -38,7 +38,7 @@ class ExtractionColumns:
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringColumns:
-    """Columns of figures of steered answers."""
+    """Columns of metrics of steered answers."""
 
     model: shared.Model
     directions: DirectionPrompt
@@ -115,7 +115,7 @@ HIDDEN_STATES = Table("hidden_states", HiddenStatesRow, partition_by=("dataset",
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeRow(ExtractionColumns):
-    """A figure of a probe of one dataset (source) on another (target) at one layer."""
+    """A metric of a probe of one dataset (source) on another (target) at one layer."""
 
     analysis: Annotated[
         str,

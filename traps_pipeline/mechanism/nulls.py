@@ -75,13 +75,13 @@ def _beside(effects: pd.DataFrame, prefix: str) -> dict[str, Any]:
     """Return the undecided share, and the mean perplexity, of the answers behind effects."""
     columns = {name: effects[name].to_numpy(float) for name in ("undecided", "perplexity")}
     known = {name: values[np.isfinite(values)] for name, values in columns.items()}
-    figures = {name: float(values.mean()) if len(values) else np.nan for name, values in known.items()}
-    return {f"{prefix}{name}": value for name, value in nan_to_null(figures).items()}
+    metrics = {name: float(values.mean()) if len(values) else np.nan for name, values in known.items()}
+    return {f"{prefix}{name}": value for name, value in nan_to_null(metrics).items()}
 
 
-def nan_to_null(figures: Mapping[str, float]) -> dict[str, Any]:
-    """Return the figures with null instead of NaN, as in tables."""
-    return {name: None if np.isnan(value) else float(value) for name, value in figures.items()}
+def nan_to_null(numbers: Mapping[str, float]) -> dict[str, Any]:
+    """Return numbers with null instead of NaN, as in tables."""
+    return {name: None if np.isnan(value) else float(value) for name, value in numbers.items()}
 
 
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
@@ -96,13 +96,13 @@ def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
         acc = control["correct"] / control["n_correct"] if control["n_correct"] else np.nan
         false_abs, abs_rec = (row["abstained"] / row["n"] if row["n"] else np.nan for row in (control, void))
         j = abs_rec - false_abs
-        figures = {"acc": acc, "false_abs": false_abs, "abs_rec": abs_rec, "j": j}
-        figures |= {"pecs": float(pecs_of(np.array(acc), np.array(j)))}
+        metrics = {"acc": acc, "false_abs": false_abs, "abs_rec": abs_rec, "j": j}
+        metrics |= {"pecs": float(pecs_of(np.array(acc), np.array(j)))}
         answers = sum(row["n"] + row["n_missing"] for row in (control, void))
         rows.append(
             SteeringPecsRow(
                 **dict(zip(keys, key if isinstance(key, tuple) else (key,), strict=True)),
-                **nan_to_null(figures),
+                **nan_to_null(metrics),
                 degenerate=(control["degenerate"] + void["degenerate"]) / answers,
                 undecided=(control["n_missing"] + void["n_missing"]) / answers,
                 perplexity=_beside(group, "")["perplexity"],

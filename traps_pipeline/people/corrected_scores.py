@@ -23,9 +23,9 @@ from traps_pipeline.scoring.bootstrap import (
     SEED,
     Resampling,
     draw_scenarios,
-    figures_of_shares,
     means_over_runs,
     metrics_of,
+    metrics_of_shares,
     resampled_sums,
     run_sums,
     shares_of,
@@ -73,9 +73,9 @@ def corrected(
     panel, rows = joined_epochs(verdicts["panel"]), list[dict[str, Any]]()
     for key, group in items.groupby(["model", "regime"], sort=True):
         model, regime = cast(tuple[str, str], key)
-        for dataset, figures in _entry(group, f"{model}|{regime}", resampling, errors).items():
+        for dataset, metrics in _entry(group, f"{model}|{regime}", resampling, errors).items():
             entry = {"model": model, "regime": regime, "dataset": dataset, "panel": panel}
-            rows.append(entry | {"n_runs": _count_runs(group, dataset)} | figures)
+            rows.append(entry | {"n_runs": _count_runs(group, dataset)} | metrics)
     return pd.DataFrame(rows, columns=pd.Index(CORRECTED.names))
 
 
@@ -147,22 +147,22 @@ def _errors_row(labels: pd.DataFrame, task: TaskName, draws: np.ndarray, panel: 
 
 
 def _entry(group: pd.DataFrame, named: str, resampling: Resampling, errors: Errors) -> dict[str, dict[str, float]]:
-    """Return the figures of one model and regime, judged and corrected, by dataset."""
+    """Return the metrics of one model and regime, judged and corrected, by dataset."""
 
     def right(sums: np.ndarray, in_mean: bool) -> np.ndarray:
         shares = shares_of(sums, in_mean)
         fixed = [_corrected_ends(shares[:, k], errors[task]) for k, task in enumerate(SHARES)]
-        return figures_of_shares(np.stack(fixed, axis=1))
+        return metrics_of_shares(np.stack(fixed, axis=1))
 
     sums = run_sums(group, resampling, named)
-    means = [means_over_runs(sums, figures, resampling.resamples + 1) for figures in (metrics_of, right)]
+    means = [means_over_runs(sums, compute, resampling.resamples + 1) for compute in (metrics_of, right)]
     return {
         dataset: {
-            **with_intervals(RESAMPLED_METRICS, figures),
+            **with_intervals(RESAMPLED_METRICS, metrics),
             **with_intervals(RESAMPLED_METRICS, means[1][dataset], "_corrected"),
         }
-        for dataset, figures in means[0].items()
-        if not np.isnan(figures[:, :, 0]).all()
+        for dataset, metrics in means[0].items()
+        if not np.isnan(metrics[:, :, 0]).all()
     }
 
 

@@ -22,7 +22,7 @@ class HumanRow:
     n_people: Annotated[int, "who labelled clips"]
     n_labels: Annotated[int, "labels of clips"]
     n_clips: Annotated[int, "clips labelled, each with its question"]
-    figures: Annotated[Weighted, EACH_METRIC, CI]
+    metrics: Annotated[Weighted, EACH_METRIC, CI]
     agreement: Annotated[float | None, "share of pairs of labels of a clip that agree whether it can be known"]
     alpha: Annotated[float | None, "Krippendorff's alpha of whether it can be known"]
     seconds: Annotated[float, "median seconds a clip"]

@@ -35,7 +35,7 @@ def stratum_weights(labels: pd.DataFrame) -> np.ndarray:
 def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
     """Return people's scores on clips (HUMAN_ROW), with intervals over scenarios.
 
-    Without a label of a clip there is no row; overall is null until all four datasets have figures.
+    Without a label of a clip there is no row; overall is null until all four datasets have metrics.
     """
     clips = labels.loc[labels["task"] == "answerability"].reset_index(drop=True)
     if clips.empty:
@@ -46,18 +46,18 @@ def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
     resampling = draw_scenarios(items, resamples, seed)
     means = means_over_runs(run_sums(items, resampling, "people"), metrics_of, resamples + 1)
     clips_of = {name: clips if name == "overall" else clips.loc[clips["dataset"] == name] for name in means}
-    rows = [_row(dataset, figures, clips_of[dataset]) for dataset, figures in means.items()]
+    rows = [_row(dataset, metrics, clips_of[dataset]) for dataset, metrics in means.items()]
     return pd.DataFrame(rows, columns=pd.Index(HUMAN_ROW.names))
 
 
-def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, Any]:
+def _row(dataset: str, metrics: np.ndarray, clips: pd.DataFrame) -> dict[str, Any]:
     _, agreement, alpha = agreement_of(label_matrix(clips, "abstained"))
     return {
         "dataset": dataset,
         "n_people": clips["annotator"].nunique(),
         "n_labels": len(clips),
         "n_clips": clips["unit"].nunique(),
-        **with_intervals(RESAMPLED_METRICS, figures),
+        **with_intervals(RESAMPLED_METRICS, metrics),
         "agreement": agreement,
         "alpha": alpha,
         "seconds": float(np.median(clips["seconds"].to_numpy(float))),
@@ -68,4 +68,4 @@ def _row(dataset: str, figures: np.ndarray, clips: pd.DataFrame) -> dict[str, An
 def with_intervals(names: Sequence[str], draws: np.ndarray, suffix: str = "") -> Mapping[str, float]:
     """Return scores with intervals as columns. draws: (2, names, 1 + resamples), observed ones first."""
     columns = [with_interval(f"{name}{suffix}", draws[:, k], limits_of(name)) for k, name in enumerate(names)]
-    return {name: value for figure_columns in columns for name, value in figure_columns.items()}
+    return {name: value for metric_columns in columns for name, value in metric_columns.items()}

@@ -273,7 +273,7 @@ def validation_text(rows: pd.DataFrame) -> str:
     headings = ["axis", "labels", "acc", "prec", "recall", "F1", "vs A", "vs B", "A = B", "kappa", "95 %"]
     shares = ("accuracy", "precision", "recall", "f1", "accuracy_a", "accuracy_b", "human_agreement")
     cells = [
-        [row["axis"], row["n_labels"], *(_figure(row[name]) for name in shares), *_kappa_cells(row)]
+        [row["axis"], row["n_labels"], *(_number(row[name]) for name in shares), *_kappa_cells(row)]
         for row in rows.to_dict("records")
     ]
     return f"{title}\n{text_table(headings, cells)}"
@@ -288,5 +288,5 @@ def _kappa_cells(row: Mapping[Any, Any]) -> tuple[str, str]:
     return f"{row['human_kappa']:.2f}", f"{row['human_kappa_low']:.2f} to {row['human_kappa_high']:.2f}"
 
 
-def _figure(value: float) -> str:
+def _number(value: float) -> str:
     return "-" if np.isnan(value) else f"{value:.3f}"

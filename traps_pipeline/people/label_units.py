@@ -3,7 +3,7 @@
 Everything that a task could label is a unit. Its id is a digest of the shown content, so that people's labels of one
 clip or answer are never taken for labels of another. A task's units are in groups, and each group in two strata: those
 that split the judges, and the others. The units with the smallest digests of a stratum are sampled, so that labels of a
-stratum are a random sample of it, and figures can weight each stratum by its share in the study.
+stratum are a random sample of it, and metrics can weight each stratum by its share in the study.
 """
 
 from functools import cache

@@ -64,10 +64,10 @@ class _Once(Generic[Value]):
 
 
 class Lineage:
-    """A snapshot of a workspace that looks each version up once. thorough: read every table in full."""
+    """A snapshot of a workspace that looks each version up once."""
 
-    def __init__(self, workspace: Workspace, *, thorough: bool = False) -> None:
-        self._workspace, self.graph, self._thorough = workspace, the_graph(), thorough
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace, self.graph, self._thorough = workspace, the_graph(), False
         workspace.store.look()
         self.version, self.state, self.damage = _Once(self._version), _Once(self._state), _Once(self._damage)
         self.status, self._there = _Once(self._status), _Once(lambda name, _: self._keys_there(name))
@@ -77,9 +77,17 @@ class Lineage:
 
     def renew(self, stage: str) -> None:
         """Forget a stage that has been built since, and all stages downstream of it."""
-        stages = self.graph.all_below(stage)
+        self._forget(self.graph.all_below(stage))
+
+    def read_in_full(self) -> None:
+        """Look again, and from now on compare every table with its checksum."""
+        if not self._thorough:
+            self._thorough = True
+            self._forget(self.graph.declared)
+
+    def _forget(self, names: Iterable[str]) -> None:
         for known in (self.version, self.state, self.damage, self.status, self._there, self._failed_checks):
-            known.renew(stages)
+            known.renew(names)
 
     def inputs(self, stage: str, key: str | None) -> dict[str, str]:
         """Return the versions of all existing inputs of a partition, by name."""
@@ -158,7 +166,7 @@ class Lineage:
         )
         return (
             any(self.status(*node).outdated for node in upstream)
-            or any(lost_parents)  # otherwise figures would be rebuilt from fewer inputs than before
+            or any(lost_parents)  # otherwise tables would be rebuilt from fewer inputs than before
             or bool(self.blocked(name, key, current=True))
         )
 

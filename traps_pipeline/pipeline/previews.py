@@ -19,7 +19,7 @@ STUDY_URL = "/study"  # route of `traps ui` to the study's report, site and clip
 
 @dataclass(frozen=True)
 class Markdown:
-    """Rendered text; use it for figures and ids, never for text that a model wrote."""
+    """Rendered text; use it for numbers and ids, never for text that a model wrote."""
 
     text: str
 

@@ -114,7 +114,7 @@ def materialize_stale(instance: dg.DagsterInstance, runs: Runs, plan: RunPlan) -
     """Materialize what is missing or stale; problems include earlier failed checks. KeyboardInterrupt propagates."""
     report, started_at, history = RunReport(), time.monotonic(), History(instance, plan.graph)
     tags = {MAKE_TAG: STALE_OR_MISSING} | ({EXPERIMENT_TAG: plan.experiment} if plan.experiment else {})
-    with remembering_stops():
+    with remembering_stops(), plan.in_progress():
         for block in plan.blocks():
             pending, keys = plan.pending(block, cache(history.recorded))
             for range_outcome in runs.make(pending, runs.ranges(pending, keys), tags):

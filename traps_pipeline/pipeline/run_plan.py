@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,19 +83,13 @@ class RunReport:
 class RunPlan:
     """The partitions of a study or of one experiment that a run makes, by a snapshot of what is there.
 
-    stages: their names; all by default. thorough: read every table in full.
+    stages: their names; all by default.
     """
 
     def __init__(
-        self,
-        workspace: Workspace,
-        experiment: str | None = None,
-        stages: Collection[str] | None = None,
-        *,
-        thorough: bool = False,
+        self, workspace: Workspace, experiment: str | None = None, stages: Collection[str] | None = None
     ) -> None:
-        self.workspace, self.experiment, self._thorough = workspace, experiment, thorough
-        self.lineage = Lineage(workspace, thorough=thorough)
+        self.workspace, self.experiment, self.lineage = workspace, experiment, Lineage(workspace)
         self.graph = self.lineage.graph
         self.partitions = self.lineage.partitions.of(experiment)
         # The wanted partitions, in the order of the graph.
@@ -150,9 +146,18 @@ class RunPlan:
     def renew(self, stages: Iterable[Stage]) -> None:
         """Look again at stages that were built since, and at all below them."""
         if self.workspace.is_shared:  # other hosts build beside this one
-            self.lineage = Lineage(self.workspace, thorough=self._thorough)
+            self.lineage = Lineage(self.workspace)
         for stage in stages:
             self.lineage.renew(stage.name)
+
+    @contextmanager
+    def in_progress(self) -> Iterator[None]:
+        """Hand this plan on to the steps that this process executes meanwhile."""
+        before = IN_PROGRESS.set(self)
+        try:
+            yield
+        finally:
+            IN_PROGRESS.reset(before)
 
     def require_work(self, until: str | None) -> None:
         """Raise TrapsError if an experiment wants nothing of the named stages (or of any)."""
@@ -208,6 +213,9 @@ class RunPlan:
             for name, keys in self.parts.items()
             for key in keys
         )
+
+
+IN_PROGRESS = ContextVar[RunPlan | None]("IN_PROGRESS", default=None)  # the plan whose runs this process executes
 
 
 def stages_until(until: str | None) -> set[str] | None:

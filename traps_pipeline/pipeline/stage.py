@@ -90,7 +90,7 @@ def stage(
     """Declare the function behind a table or, given a name, files (`graph.Stage`).
 
     The description is the function's docstring, without its "Return"; the code is `code_of` the group, unless stated.
-    It returns a StageOutput, or rows alone (figures and ids, never text that a model wrote), which are then shown.
+    It returns a StageOutput, or rows alone (numbers and ids, never text that a model wrote), which are then shown.
     side_by_side: it gets the keys of several partitions, and yields each with its StageOutput or TrapsError.
     """
 

@@ -28,7 +28,7 @@ from traps_pipeline.pipeline.machine import nothing_to_do_reason, parts_of_run, 
 from traps_pipeline.pipeline.making import PartitionMaker
 from traps_pipeline.pipeline.metadata import page_text, partition_metadata, tally_metadata, visible_metadata
 from traps_pipeline.pipeline.partition_checks import StageChecks, raise_for_run
-from traps_pipeline.pipeline.run_plan import RunPlan
+from traps_pipeline.pipeline.run_plan import IN_PROGRESS, RunPlan
 from traps_pipeline.pipeline.runs import report_canceling
 from traps_pipeline.storage.parquet import StageOutput, State
 from traps_pipeline.storage.workspace import Workspace
@@ -78,15 +78,17 @@ def run_step(stage: Stage, context: dg.AssetExecutionContext, workspace: Workspa
 
 
 def _plan_of(run: dg.DagsterRun, workspace: Workspace) -> RunPlan:
-    """Return the plan, with its snapshot, that a run's steps share; one for each step if other hosts build, too.
+    """Return the plan that this process carries out, or that a run's steps share; of a step if other hosts build, too.
 
     If another process builds a partition between two steps, the later step records its older version, so that the next
     run makes the result once more.
     """
-    if run.run_id not in _PLANS or workspace.is_shared:
+    plan = None if workspace.is_shared else IN_PROGRESS.get() or _PLANS.get(run.run_id)
+    if plan is None:
         _PLANS.clear()
-        _PLANS[run.run_id] = RunPlan(workspace, run.tags.get(EXPERIMENT_TAG), thorough=True)
-    return _PLANS[run.run_id]
+        plan = _PLANS[run.run_id] = RunPlan(workspace, run.tags.get(EXPERIMENT_TAG))
+    plan.lineage.read_in_full()  # a run builds nothing from an altered table
+    return plan
 
 
 class _Step:
@@ -198,7 +200,7 @@ def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
     """Forward a step's events; log progress, and keep keys out of stored tracebacks."""
     report = progress.current()
     try:
-        with report.heard_by(lambda line: context.log.info(page_text(line))):
+        with report.reporting_to(lambda line: context.log.info(page_text(line))):
             yield from events
             report.end_stage()
     except Exception as error:

@@ -30,14 +30,14 @@ TWIN = "twin_control"
 INFERENCE_ARMS = ("late_occluder", "predictable_cut")  # the outcome is not shown, but can be inferred
 ARMS = ("length_matched", TWIN, *INFERENCE_ARMS)
 # Two events side by side, with each, both or neither of them hidden, and a question about either
-# (protocol/two_events.py). No part of PECS or of the arms' figures; run on request.
+# (protocol/two_events.py). No part of PECS or of the arms' metrics; run on request.
 TWO_EVENTS = "two_events"
 REPLACED = ("decoy", "removed", "crossed")  # arms of 0.3 that two events take the place of
-# Controls cut where the likeliest answer has a stated probability (docs/arms.md, "Graded cuts"). In no figure
+# Controls cut where the likeliest answer has a stated probability (docs/arms.md, "Graded cuts"). In no metric
 # of pairs or arms; run on request.
 GRADED = "graded"
 # Datasets that change one property of the pairs, step by step, to test the paper's untested assumptions
-# (docs/hypotheses.md). No part of PECS or of the arms' figures; run on request.
+# (docs/hypotheses.md). No part of PECS or of the arms' metrics; run on request.
 LABEL_DOSES = ("labels_two", "labels_three", "labels_six")
 OCCLUDER_LOOKS = ("occluder_grey", "occluder_magenta", "occluder_large")  # still voids
 OCCLUDER_DOSES = ("occluder_alpha_50",)  # the occluder lets the outcome through: no voids

@@ -17,13 +17,13 @@ Formula = Callable[["np.ndarray", "np.ndarray", "np.ndarray"], "np.ndarray"]
 
 @dataclass(frozen=True)
 class Metric:
-    """A model's figure; `side` is the side whose items it counts ("" for both)."""
+    """A number of the leaderboard; `side` is the side whose items it counts ("" for both)."""
 
     name: str
     heading: str
     meaning: str
     formula: Formula
-    """The figure from Acc, FalseAbs and AbsRec, (..) each."""
+    """The metric from Acc, FalseAbs and AbsRec, (..) each."""
     side: str = ""
     lowest: float = 0.0
     less_is_better: bool = False
@@ -50,7 +50,7 @@ class Metric:
         return low(acc[0], false_abs[worst], abs_rec[0]), self.formula(acc[1], false_abs[best], abs_rec[1])
 
 
-# In the order in which figures of one entry are printed.
+# In the order in which metrics of one entry are printed.
 METRIC_WORDS: Mapping[str, Metric] = {
     metric.name: metric
     for metric in (

@@ -23,6 +23,7 @@ from traps_pipeline.protocol.datasets import ARMS, DATASETS, TWO_EVENTS
 from traps_pipeline.protocol.regimes import REGIMES
 from traps_pipeline.release.held_out_clips import clip_name
 from traps_pipeline.release.released_rows import (
+    PAIRS,
     CertificateRow,
     HeldOutItemRow,
     PairRow,
@@ -121,20 +122,9 @@ def pair_rows(content: Content) -> list[PairRow]:
         if len(sides) < 2:
             raise TrapsError(f"{pair_id}: only its {next(iter(sides))} is there; make items again")
         control, void = sides["control"], sides["void"]
-        shared_columns = (
-            "pair_id",
-            "dataset",
-            "scenario_id",
-            "taxonomy",
-            "category",
-            "sub_scenario",
-            "labels",
-            "aliases",
-        )
-        shared_columns += ("answer_type", "ground_truth", "benchmark_version")
         rows.append(
             PairRow(
-                **{name: control[name] for name in shared_columns},
+                **{name: control[name] for name in PAIRS.names if name in control},
                 control_item_id=control["item_id"],
                 void_item_id=void["item_id"],
                 control_file_name=control["clip"],
@@ -199,19 +189,21 @@ def certificate_rows(content: Content) -> list[CertificateRow]:
 def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]:
     import numpy as np
 
-    canary = content.release.canary
-    if spec.is_recorded:
-        failure = content.people[spec.scenario_id]
-        yield CertificateRow(
+    def row(name: str, about: str, promises: str, failure: str | None, evidence: Mapping[str, Any]) -> CertificateRow:
+        return CertificateRow(
             scenario_id=spec.scenario_id,
-            certificate="people",
-            about="void",
-            promises="People who saw one clip at a time answered the control rightly and could not know the void.",
+            certificate=name,
+            about=about,
+            promises=" ".join(promises.split()),
             holds=failure is None,
             failure=failure,
-            evidence=json.dumps(spec.evidence, sort_keys=True, ensure_ascii=False),
-            canary=canary,
+            evidence=json.dumps(evidence, sort_keys=True, ensure_ascii=False, default=list),
+            canary=content.release.canary,
         )
+
+    if spec.is_recorded:
+        promises = "People who saw one clip at a time answered the control rightly and could not know the void."
+        yield row("people", "void", promises, content.people[spec.scenario_id], spec.evidence)
         return
     record_evidence, claim = stored_evidence(spec), Claim.of_record(spec)
     empty_trajectory = np.empty((0, 0), np.float32)  # words are certified without a trajectory
@@ -222,16 +214,7 @@ def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]
         )
         failure = certificate.failure(evidence, claim)
         numbers = {n.name: evidence[n.name] for n in certificate.numbers if n.name in evidence}
-        yield CertificateRow(
-            scenario_id=spec.scenario_id,
-            certificate=certificate.name,
-            about=certificate.about,
-            promises=" ".join(certificate.promises.split()),
-            holds=failure is None,
-            failure=failure,
-            evidence=json.dumps(numbers, sort_keys=True, ensure_ascii=False, default=list),
-            canary=canary,
-        )
+        yield row(certificate.name, certificate.about, certificate.promises, failure, numbers)
 
 
 def split_rows(content: Content) -> list[SplitRow]:

@@ -24,7 +24,7 @@ from traps_pipeline.benchmark.held_out import (
 )
 from traps_pipeline.release import content as rows_of
 from traps_pipeline.release.card import card, dictionary
-from traps_pipeline.release.checksums import CHECKSUMS, write_checksums
+from traps_pipeline.release.checksums import CHECKSUMS, read_checksums, released_files, write_checksums
 from traps_pipeline.release.content import CLIPS, Content
 from traps_pipeline.release.croissant import croissant
 from traps_pipeline.release.held_out_clips import date_equally, write_held_out_clips
@@ -50,14 +50,9 @@ RECORDED_LICENCE = (
     "Clips and words of each pair: as its importer states in the columns source, licence of metadata.jsonl."
 )
 # The hub's loader finds clips only below their table's folder: pairs name them from the top, items from clips/.
-PLACES: Mapping[str, str] = {
+PLACES: Mapping[str, str] = {table.name: f"{table.name}.jsonl" for table in OPEN} | {
     PAIRS.name: "metadata.jsonl",
     RELEASED_ITEMS.name: f"{CLIPS}/metadata.jsonl",
-    SCENARIOS.name: "scenarios.jsonl",
-    TWO_EVENTS_SCENARIOS.name: "two_events.jsonl",
-    CERTIFICATES.name: "certificates.jsonl",
-    SPLITS.name: "splits.jsonl",
-    PROMPTS.name: "prompts.jsonl",
 }
 
 
@@ -98,7 +93,7 @@ class _Folder:
     def text(self, name: str, text: str) -> None:
         write_text(self.root / name, self.hide(text))
 
-    def table(self, table: Table[Any], rows: Sequence[Any]) -> None:
+    def write_table(self, table: Table[Any], rows: Sequence[Any]) -> None:
         lines = [json.dumps({n: getattr(row, n) for n in table.names}, ensure_ascii=False) + "\n" for row in rows]
         self.text(PLACES[table.name], "".join(lines))
         self.rows[table.name] = len(rows)
@@ -117,7 +112,7 @@ def write_release(content: Content, target: Path, options: Options) -> ReleaseSu
         answers = _open_release(folder, content) if options.held_out is None else None
         if options.held_out is not None:
             answers = _held_out_release(folder, content, options.held_out)
-        folder.table(PROMPTS, rows_of.prompt_rows(content.release.canary))
+        folder.write_table(PROMPTS, rows_of.prompt_rows(content.release.canary))
         _pages(folder, content, options)
         files = write_checksums(part, content.release.canary) + 1
         if options.held_out is not None:
@@ -127,8 +122,6 @@ def write_release(content: Content, target: Path, options: Options) -> ReleaseSu
 
 def _require_own(target: Path) -> None:
     """Raise TrapsError unless a folder is missing, empty, or a former release that may be replaced."""
-    from traps_pipeline.release.checksums import read_checksums, released_files
-
     if not (target / CHECKSUMS).is_file():
         if target.exists() and any(target.iterdir()):
             raise TrapsError(f"{target}: holds other files than a release; give an empty or a new folder")
@@ -139,13 +132,13 @@ def _require_own(target: Path) -> None:
 
 
 def _open_release(folder: _Folder, content: Content) -> None:
-    folder.table(PAIRS, rows_of.pair_rows(content))
-    folder.table(RELEASED_ITEMS, rows_of.item_rows(content))
-    folder.table(SCENARIOS, rows_of.scenario_rows(content))
+    folder.write_table(PAIRS, rows_of.pair_rows(content))
+    folder.write_table(RELEASED_ITEMS, rows_of.item_rows(content))
+    folder.write_table(SCENARIOS, rows_of.scenario_rows(content))
     if content.two_events:
-        folder.table(TWO_EVENTS_SCENARIOS, rows_of.two_events_rows(content))
-    folder.table(CERTIFICATES, rows_of.certificate_rows(content))
-    folder.table(SPLITS, rows_of.split_rows(content))
+        folder.write_table(TWO_EVENTS_SCENARIOS, rows_of.two_events_rows(content))
+    folder.write_table(CERTIFICATES, rows_of.certificate_rows(content))
+    folder.write_table(SPLITS, rows_of.split_rows(content))
     for name, source in sorted(content.clips.items()):
         write_bytes(folder.root / name, source.read_bytes())
 
@@ -158,7 +151,7 @@ def _held_out_release(folder: _Folder, content: Content, key_file: Path) -> Path
     items = drawn_items(content.items, key)
     mark_held_out(content.study, items)
     digests = write_held_out_clips(items, content.clips, key, folder.root / CLIPS / "items")
-    folder.table(HELD_OUT_ITEMS, rows_of.held_out_rows(items, digests, key, content.release.canary))
+    folder.write_table(HELD_OUT_ITEMS, rows_of.held_out_rows(items, digests, key, content.release.canary))
     names = sorted((opaque_name(key, row["item_id"]), row["item_id"]) for row in items)
     answers = key_file.with_name(f"{key_file.name}.items.jsonl")
     lines = "".join(json.dumps({"item": n, "item_id": id_}) + "\n" for n, id_ in names)
@@ -183,7 +176,9 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
         folder.text(COMMITMENT, options.commitment.read_text(encoding="utf-8"))
     manifest = {
         "format": FORMAT,
-        **_description(content),
+        **content.release.model_dump(),
+        "versions": content.versions,
+        **({"recorded": True} if content.people else {}),
         "held_out": options.held_out is not None,
         "anonymous": options.anonymous,
         "date": options.date,
@@ -195,12 +190,6 @@ def _pages(folder: _Folder, content: Content, options: Options) -> None:
     folder.text(DICTIONARY, dictionary(tables, PLACES, canary))
     folder.text(CARD, card(manifest, tables, PLACES))
     folder.text(CROISSANT, croissant(folder.root, manifest, tables, PLACES))
-
-
-def _description(content: Content) -> dict[str, Any]:
-    """Return name, version and canary of the release, and the version of each dataset."""
-    recorded = {"recorded": True} if content.people else {}
-    return {**content.release.model_dump(), "versions": content.versions, **recorded}
 
 
 # --- double-blind review ----------------------------------------------------------------------------------------------

@@ -52,8 +52,8 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
     dataset: the repository of the release, as the hub names it.
 
     `eval_results/MODEL.yaml` goes into the model's repository as `.eval_results/traps.yaml`, with a task for each
-    regime; `data/` has the layout of Every Eval Ever, with each figure and its interval. Raises TrapsError if there is
-    no overall figure.
+    regime; `data/` has the layout of Every Eval Ever, with each metric and its interval. Raises TrapsError if there is
+    no overall metric.
     """
     if not _REPOSITORY.fullmatch(dataset):
         raise TrapsError(f"--dataset {dataset!r:.80}: is no repository of the hub; write it as OWNER/NAME")
@@ -61,16 +61,11 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
     overall = board.loc[(board["dataset"] == "overall") & board["pecs"].notna()]
     if overall.empty:
         raise TrapsError(f"{workspace.root}: no model has all four datasets yet; run the experiment first")
-    answers: list[dict[Any, Any]] = current_rows(workspace, RESPONSES, ["item_id", "model", "created_at"]).to_dict(
-        "records"
-    )
-    times: dict[str, list[pd.Timestamp]] = {}
-    for row in answers:
-        times.setdefault(row["model"], []).append(row["created_at"])
+    times = current_rows(workspace, RESPONSES, ["item_id", "model", "created_at"]).groupby("model")["created_at"].max()
     files = []
     for model, rows in overall.groupby("model", sort=True):
         entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
-        evaluated_at = max(times[str(model)])
+        evaluated_at = times[str(model)]
         hub = [_hub_entry(row, dataset, evaluated_at) for row in entries]
         files.append(f"{HUB}/{model}.yaml")
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))
@@ -135,7 +130,7 @@ def _every_eval_results(row: Row, dataset: str, release: Release) -> Iterator[di
                 "source_type": "hf_dataset",
                 "hf_repo": dataset,
                 "hf_split": "test",
-                "samples_number": 2 * int(row["n_pairs"]),
+                "samples_number": int(row["n_items"]),
             },
             "metric_config": {
                 "evaluation_description": metric.meaning,

@@ -40,13 +40,16 @@ from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 ABOUT = "submission.json"
 TABLES: Mapping[str, Table[Any]] = {
     f"{t.name}.parquet": t for t in (ITEMS, RESPONSES, VOTES, METRICS, LEADERBOARD, TWO_WAY)
 }
 SUBMITTED_DATASETS = (*DATASETS, TWO_EVENTS)  # the second may be absent
-MAX_FILE_BYTES, MAX_TABLE_BYTES, MAX_ROWS = 2 * 2**30, 4 * 2**30, 20_000_000
+MAX_FILE_BYTES, MAX_TABLE_BYTES, MAX_VALUES = 2 * 2**30, 2**30, 100_000_000
+MAX_TEXT_BYTES = 16 * 2**20  # no call answers with more
 MAX_ABOUT_BYTES = 2**20
 
 
@@ -65,7 +68,7 @@ class SubmittedJudge(_Strict):
     premise: bool = False
 
 
-class About(_Strict):
+class SubmissionAbout(_Strict):
     """What a submission says of itself: the contents of `submission.json`.
 
     panel: name of the panel. prompts: version of each regime's. versions: code versions of the tables. files:
@@ -89,11 +92,11 @@ class Submission:
     """A submission in memory. altered: tables whose digest differs from `about`."""
 
     path: Path
-    about: About
+    about: SubmissionAbout
     tables: Mapping[str, pd.DataFrame]
     altered: tuple[str, ...]
 
-    def table(self, table: Table[Any]) -> pd.DataFrame:
+    def read_table(self, table: Table[Any]) -> pd.DataFrame:
         """Return the rows of one of its tables."""
         return self.tables[f"{table.name}.parquet"]
 
@@ -101,7 +104,7 @@ class Submission:
 # --- packing ----------------------------------------------------------------------------------------------------------
 
 
-def pack_submission(workspace: Workspace, target: Path, name: str) -> About:
+def pack_submission(workspace: Workspace, target: Path, name: str) -> SubmissionAbout:
     """Write a study's submission, equal bytes for equal studies. Raises TrapsError unless it is judged and scored."""
     begin_publication(workspace.root, "a submission")
     study = workspace.study
@@ -123,7 +126,7 @@ def pack_submission(workspace: Workspace, target: Path, name: str) -> About:
         for seat in load_panel(study.panel)
     ]
     try:
-        description = About(
+        description = SubmissionAbout(
             name=name,
             benchmark=load_release().name,
             version=load_release().version,
@@ -175,7 +178,7 @@ def read_submission(path: Path) -> Submission:
     except BadArchive as error:
         raise TrapsError(f"{path}: is no submission ({plain(error)[:200]}); get it again") from error
     try:
-        description = About.model_validate_json(content[ABOUT])
+        description = SubmissionAbout.model_validate_json(content[ABOUT])
     except ValidationError as error:
         raise TrapsError(f"{path}: {ABOUT}: {faults_of(error)}; pack it again with `traps publish submit`") from error
     altered_tables = [
@@ -207,15 +210,19 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
     import pyarrow.parquet as pq
 
     table = TABLES[file]
+    schema = table.arrow_schema()
     try:
         parquet = pq.ParquetFile(pa.BufferReader(content))
         groups = [parquet.metadata.row_group(i) for i in range(parquet.metadata.num_row_groups)]
-        if parquet.metadata.num_rows > MAX_ROWS or sum(g.total_byte_size for g in groups) > MAX_TABLE_BYTES:
-            raise TrapsError(f"{path}: {file} is too large ({parquet.metadata.num_rows} rows)")
-        schema = table.arrow_schema()
+        chunks = [group.column(i) for group in groups for i in range(group.num_columns)]
+        n_values, size = (sum(getattr(c, n) for c in chunks) for n in ("num_values", "total_uncompressed_size"))
+        if n_values > MAX_VALUES or size > MAX_TABLE_BYTES:
+            raise TrapsError(f"{path}: {file} is too large ({n_values} values, {size} bytes); submit models one by one")
         if parquet.schema_arrow.names != schema.names or parquet.schema_arrow.types != schema.types:
             raise TrapsError(f"{path}: {file} has other columns than this version's; pack it again, or verify it there")
-        data = parquet.read().replace_schema_metadata(None)  # what pandas would make of a stranger's is not wanted
+        texts = {chunk.path_in_schema for chunk in chunks if chunk.physical_type == "BYTE_ARRAY"}
+        data = _with_bounded_texts(path, file, pq.ParquetFile(pa.BufferReader(content), read_dictionary=sorted(texts)))
+        data = data.cast(parquet.schema_arrow).replace_schema_metadata(None)  # a stranger's would decide what is read
         frame = data.to_pandas(ignore_metadata=True)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise TrapsError(f"{path}: {file} is no readable table ({plain(error)[:200]}); pack it again") from error
@@ -226,3 +233,22 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
     if keys.duplicated().any():
         raise TrapsError(f"{path}: {file}: {records(keys.loc[keys.duplicated()])[0]} stands there twice")
     return frame
+
+
+def _with_bounded_texts(path: Path, file: str, parquet: pq.ParquetFile) -> pa.Table:
+    """Return a table, its texts as dictionaries that store one of many rows once. Raises TrapsError for large texts."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    data, longest, total = parquet.read(), 0, 0
+    for column in data.columns:
+        texts = pc.list_flatten(column) if pa.types.is_list(column.type) else column
+        for chunk in texts.chunks if pa.types.is_dictionary(texts.type) else ():
+            sizes = pc.binary_length(chunk.dictionary).take(chunk.indices)
+            longest, total = max(longest, pc.max(sizes).as_py() or 0), total + (pc.sum(sizes).as_py() or 0)
+    if longest > MAX_TEXT_BYTES or total > MAX_TABLE_BYTES:
+        raise TrapsError(
+            f"{path}: {file}: its longest text has {longest} bytes and all have {total}, at most {MAX_TEXT_BYTES} and "
+            f"{MAX_TABLE_BYTES} are read; submit models one by one, without such texts"
+        )
+    return data

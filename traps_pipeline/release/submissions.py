@@ -40,7 +40,7 @@ class AcceptedSubmission:
     @property
     def group(self) -> tuple[str, str]:
         """The items' digest and the panel, which submissions ranked together share."""
-        items = self.submission.table(ITEMS)
+        items = self.submission.read_table(ITEMS)
         description = self.submission.about
         return digest(sorted(items["item_hash"]))[:16], id_of_judges(description.panel, description.judges)
 
@@ -123,7 +123,7 @@ def _group(key: tuple[str, str], members: Sequence[AcceptedSubmission]) -> Ranke
         parts.append(verdicts.assign(model=[names[model] for model in verdicts["model"]]))
     verdicts = pd.concat(parts, ignore_index=True)
     versions = " + ".join(sorted(verdicts["benchmark_version"].unique()))
-    items = len(members[0].submission.table(ITEMS))
+    items = len(members[0].submission.read_table(ITEMS))
     scored = score(verdicts)
     return RankedGroup(*key, versions, items, scored.board, scored.two_way, submissions)
 

@@ -74,7 +74,7 @@ class Verification:
     verdicts: pd.DataFrame | None = None
     scored: Scores | None = None
 
-    def look(self, topic: str, complaints: Iterator[str]) -> None:
+    def record_check(self, topic: str, complaints: Iterator[str]) -> None:
         """Record a check of a submission and its problems; count those beyond the first few."""
         problems = list(complaints)
         self.checked.append(topic)
@@ -98,20 +98,20 @@ def verify_file(path: Path, released: Released | None = None) -> tuple[Submissio
 def verify(submission: Submission, released: Released | None = None) -> Verification:
     """Verify a submission, against `released_items` of a folder if given."""
     verification = Verification()
-    items = {row["item_id"]: row for row in records(submission.table(ITEMS))}
-    answers, votes = records(submission.table(RESPONSES)), records(submission.table(VOTES))
-    verification.look("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
-    verification.look("items", _wrong_items(items.values()))
-    verification.look("prompts", _wrong_prompts(submission))
-    verification.look("answers", _wrong_answers(answers, items))
-    verification.look("panel", _wrong_panel(submission, votes))
+    items = {row["item_id"]: row for row in records(submission.read_table(ITEMS))}
+    answers, votes = records(submission.read_table(RESPONSES)), records(submission.read_table(VOTES))
+    verification.record_check("tables", (f"{file}: is not the table that was packed" for file in submission.altered))
+    verification.record_check("items", _wrong_items(items.values()))
+    verification.record_check("prompts", _wrong_prompts(submission))
+    verification.record_check("answers", _wrong_answers(answers, items))
+    verification.record_check("panel", _wrong_panel(submission, votes))
     is_judged_by_rules = all(seat.backend == RULE for seat in submission.about.judges)
-    verification.look("votes", _wrong_votes(submission, votes, answers, items))
+    verification.record_check("votes", _wrong_votes(submission, votes, answers, items))
     _numbers(verification, submission)
     if released is None:
         verification.unchecked.append("items and clips against a release: name its folder with --release")
     else:
-        verification.look("items and clips against the release", _foreign_items(items, released))
+        verification.record_check("items and clips against the release", _foreign_items(items, released))
     verification.unchecked.append("that the answers are the model's: only who asked it knows")
     verification.unchecked.append("that the clips named by digest are those that the model was sent")
     columns = [f"{table} {', '.join(names)}" for table, names in NOT_RECOMPUTED.items()]
@@ -164,7 +164,7 @@ def _wrong_prompts(submission: Submission) -> Iterator[str]:
             yield f"regime {regime[:40]!r}: is unknown"
         elif version != prompt_version(regime):
             yield f"regime {regime}: was asked with another prompt than this version's"
-    for regime in sorted({*submission.table(RESPONSES)["regime"]} - {*submission.about.prompts}):
+    for regime in sorted({*submission.read_table(RESPONSES)["regime"]} - {*submission.about.prompts}):
         yield f"regime {str(regime)[:40]!r}: was asked with a prompt that is not named"
 
 
@@ -341,7 +341,7 @@ def _numbers(verified: Verification, submission: Submission) -> None:
     """Recompute verdicts, metrics and leaderboard; record differing numbers."""
     panel = id_of_judges(submission.about.panel, submission.about.judges)
     try:
-        tables = (submission.table(table) for table in (ITEMS, RESPONSES, VOTES))
+        tables = (submission.read_table(table) for table in (ITEMS, RESPONSES, VOTES))
         items, answers, votes = tables
         columns = [c for c in items.columns if c not in answers.columns or c in ("item_id", "benchmark_version")]
         verdicts = verdicts_of(items.loc[:, columns], answers.drop(columns="benchmark_version"), votes).fillna(
@@ -351,15 +351,15 @@ def _numbers(verified: Verification, submission: Submission) -> None:
     except (TrapsError, ValueError, KeyError, TypeError) as error:
         verified.problems.append(f"no number can be computed: {error}")
         return
-    verified.look("metrics", _number_differences(METRICS, submission.table(METRICS), verified.scored.metrics))
-    verified.look("leaderboard", _number_differences(LEADERBOARD, submission.table(LEADERBOARD), verified.scored.board))
-    if len(submission.table(TWO_WAY)) or len(verified.scored.two_way):
-        verified.look("two events", _number_differences(TWO_WAY, submission.table(TWO_WAY), verified.scored.two_way))
+    verified.record_check("metrics", _number_differences(METRICS, submission, verified.scored.metrics))
+    verified.record_check("leaderboard", _number_differences(LEADERBOARD, submission, verified.scored.board))
+    if len(submission.read_table(TWO_WAY)) or len(verified.scored.two_way):
+        verified.record_check("two events", _number_differences(TWO_WAY, submission, verified.scored.two_way))
 
 
-def _number_differences(table: Table[Any], stated: pd.DataFrame, recomputed: pd.DataFrame) -> Iterator[str]:
+def _number_differences(table: Table[Any], submission: Submission, recomputed: pd.DataFrame) -> Iterator[str]:
     key = list(table.key)
-    frames = (stated, recomputed)
+    frames = (submission.read_table(table), recomputed)
     stated_rows, own_rows = ({tuple(row[k] for k in key): row for row in records(frame)} for frame in frames)
     for entry in sorted({*stated_rows, *own_rows}, key=str):
         name = f"{table.name} {' '.join(map(str, entry))}"

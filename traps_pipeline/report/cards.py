@@ -161,12 +161,11 @@ def _failure(what: str, sources: Sources, error: Exception) -> str:
 
 
 def picture_card(picture: Picture) -> Card:
-    """Return the card of pictures of clips."""
+    """Return the card of a picture of clips."""
     try:
-        images = [_picture(name, figure, "webp") for name, figure in picture.figures().items()]
+        pictures = {"": _picture(picture.name, picture.figure(), "webp")}
     except NotRun as reason:
         return Card(picture.name, picture.title, why=str(reason))
-    pictures = {f"{k}" if k > 1 else "": image for k, image in enumerate(images, 1)}
     return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title))
 
 

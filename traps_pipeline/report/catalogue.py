@@ -86,7 +86,7 @@ class TableReport:
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """Return the paper's tables as printed, with figures that only its text states."""
+        """Return the paper's tables as printed, with numbers that only its text states."""
         from traps_pipeline.report.printed_tables import paper_tables
 
         return paper_tables(self.name)

@@ -116,7 +116,7 @@ def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledCli
     control, times_s = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, times_s, moments)
-    return sample_clip(control, times_s, times), sample_clip(void, void_at, times), times
+    return _sample_clip(control, times_s, times), _sample_clip(void, void_at, times), times
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
@@ -132,7 +132,7 @@ def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarra
     ]
 
 
-def sample_clip(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
+def _sample_clip(frames: np.ndarray, at: np.ndarray, times: np.ndarray) -> SampledClip:
     """Return the frames nearest to the times; a clip ends a frame after its last one."""
     step = float(at[1] - at[0]) if len(at) > 1 else 0.0
     end = float(at[-1]) + step
@@ -160,27 +160,27 @@ def draw_pair(
             if k < clip.known:
                 canvas[top : top + height, left : left + width] = _fit(clip.frames[k], height, width)
                 continue
-            hatch(axes, (left, top, width - 1, height - 1), f"cut at {clip.end_s:.1f} s", layout.small)
+            _hatch(axes, (left, top, width - 1, height - 1), f"cut at {clip.end_s:.1f} s", layout.small)
     axes.imshow(canvas, interpolation="antialiased")
     for k, time in enumerate(times):
         place = (k * (width + GAP) + width / 2, 2 * height + 2 * GAP)
         axes.text(*place, f"{time:.1f} s", ha="center", va="top", size=layout.small, color="#667085")
     axes.set_axis_off()
-    _draw_header(axes, pair, layout)
+    _plot_header(axes, pair, layout)
 
 
-def hatch(axes: Axes, box: tuple[float, float, float, float], words: str, size: float, **place: Any) -> None:
+def _hatch(axes: Axes, box: tuple[int, int, int, int], words: str, size: float) -> None:
     """Hatch a box (left, top, width, height) that has no frame, and write in its middle why."""
     from matplotlib.patches import Rectangle
 
     left, top, width, height = box
     look: dict[str, Any] = {"hatch": "////", "facecolor": "#f2f4f7", "edgecolor": "#c3c9d2", "linewidth": 0.5}
-    axes.add_patch(Rectangle((left, top), width, height, **look, **place))
+    axes.add_patch(Rectangle((left, top), width, height, **look))
     look = {"bbox": {"facecolor": "white", "edgecolor": "none", "pad": 2}, "ha": "center", "va": "center"}
-    axes.text(left + width / 2, top + height / 2, words, size=size, **look, **place)
+    axes.text(left + width / 2, top + height / 2, words, size=size, **look)
 
 
-def _draw_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
+def _plot_header(axes: Axes, pair: pd.DataFrame, layout: Layout) -> None:
     """Draw scenario and ground truth in bold, and the questions below them."""
     question_of = {side: str(pair.at[side, "question"]) for side in ("control", "void")}
     is_same = question_of["control"] == question_of["void"]

@@ -70,7 +70,7 @@ LEGEND = {
     **{metric.heading: metric.meaning for metric in METRIC_WORDS.values()},
     "95 % CI": "interval of PECS, Bayesian bootstrap over scenarios with one unseen",
     "±": "population standard deviation over runs",
-    "n": "pairs (one control, one void) per run",
+    "n": "pairs (one control, one void; a held-out set asks one of both) per run",
     "Missing": f"items over all runs without an answer or a majority; {MISSING_MARK} shares are over the other items",
     INCOMPLETE_MARK: f"incomplete: fewer than {ENOUGH} of items answered; an overall metric is incomplete if that of "
     "any dataset is",
@@ -83,7 +83,7 @@ LEGEND = {
     BOUNDS: "PECS of all items if every missing decision were the worst for the model (a control wrong and abstained "
     "on, a void not abstained on), and if every one were the best; computed per run, then averaged",
     **TWO_WAY_MEANINGS,
-    "Epoch": "the evaluation campaign; figures of different epochs are not put in one ratio",
+    "Epoch": "the evaluation campaign; metrics of different epochs are not put in one ratio",
     "Overall": "equal-weight mean over the four datasets",
 }
 
@@ -145,7 +145,7 @@ def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool
 def shortfall(board: pd.DataFrame) -> str:
     """Return why models lack answers, and what to change, in a sentence; empty if none lacks a fifth of them."""
     rows = board.loc[board["dataset"] != "overall"]
-    rows = rows.assign(asked=2 * rows["n_pairs"].astype(int) * rows["n_runs"].astype(int))
+    rows = rows.assign(asked=rows["n_items"].astype(int) * rows["n_runs"].astype(int))
     sums = rows.groupby("model", sort=False)[["asked", "n_missing"]].sum()
     models = [*sums.index[sums["n_missing"] > LACKING * sums["asked"]]]
     if not models:
@@ -219,7 +219,7 @@ def _leaderboard(
     if two_way is not None and len(shown := rows[["model", "regime"]].merge(two_way.loc[two_way["n_scenarios"] > 0])):
         rows = rows.merge(shown[["model", "regime", *(column.field for column in TWO_WAY_COLUMNS)]], "left")
         columns += TWO_WAY_COLUMNS
-        refusals = [f"no figure of two events: {reason}" for reason in shown["refused"].dropna().unique()]
+        refusals = [f"no metric of two events: {reason}" for reason in shown["refused"].dropna().unique()]
     columns += [replace(N, mark="n_mark", group=True), RUNS, replace(MISSING, mark="missing_mark")]
     columns += [column for column, field in OPTIONAL.items() if (rows.loc[:, field] > 0).any()]
     columns += [
@@ -256,7 +256,7 @@ def _entries(board: pd.DataFrame, dataset: str, others: Sequence[str]) -> pd.Dat
         counted_rows = list(dataset_rows.values()) if main_row is None else [main_row]
         entry: dict[str, Any] = {name: counted_rows[0][name] for name in ("model", "regime")} | (main_row or {})
         entry |= {name: _total(row[name] for row in counted_rows) for name in _SUMMED}
-        n_controls = sum(row["n_pairs"] * row["n_runs"] for row in counted_rows)
+        n_controls = sum(row["n_items"] * row["n_runs"] for row in counted_rows) / 2  # in a held-out set about half
         is_marked = (entry["n_overruled"] or 0) > OVERRULED_ABOVE * n_controls
         entry["overruled_mark"] = OVERRULED_MARK if is_marked else ""
         entry["mark"] = _mark(main_row) if main_row else ""

@@ -24,6 +24,6 @@ def as_numbers(values: pd.Series) -> pd.Series:
     if not matches or not all(matches) or len({match[2] for match in matches if match}) > 1:
         return values
     scale = 100.0 if matches[0] and matches[0][2] and not str(values.name).endswith("_pct") else 1.0
-    figures = [None if t is None else float(t.removesuffix("%").replace("−", "-")) / scale for t in texts]
-    are_integers = scale == 1.0 and all(figure is None or figure.is_integer() for figure in figures)
-    return pd.Series(figures, values.index, "Int64" if are_integers and None not in figures else "Float64", values.name)
+    numbers = [None if t is None else float(t.removesuffix("%").replace("−", "-")) / scale for t in texts]
+    are_integers = scale == 1.0 and all(number is None or number.is_integer() for number in numbers)
+    return pd.Series(numbers, values.index, "Int64" if are_integers and None not in numbers else "Float64", values.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from traps_pipeline.report.cards import (
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, RECOMPUTED, TABLE_REPORTS, TableReport
 from traps_pipeline.report.leaderboard_page import leaderboard_markdown
 from traps_pipeline.report.page import report_html
-from traps_pipeline.report.pair_pictures import PairPictures
+from traps_pipeline.report.pair_pictures import pair_pictures
 from traps_pipeline.report.printed_tables import audit_table
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_findings import study_findings
@@ -68,8 +69,8 @@ def report_parts(sources: Sources, address: LinkOf | None = explorer_address) ->
         for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
     pictures = [
-        Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, lambda each=each: each.shown())
-        for each in PairPictures(sources.workspace).all()
+        Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, lambda each=each: each.inputs)
+        for each in pair_pictures(sources.workspace)
     ]
     tables = [
         Part(
@@ -148,13 +149,10 @@ def _export_reports(sources: Sources, say: Callable[[str], None]) -> Iterator[tu
             yield from report.files(source).items()
             say(f"{source.source}: {report.name}")
     yield from ((f"tables/{RECOMPUTED}/{name}", content) for name, content in table_files(audit_table()).items())
-    for picture in PairPictures(sources.workspace).all():
-        try:
-            figures = picture.figures()
-        except NotRun:
-            continue
-        for name, figure in figures.items():
-            yield from ((f"figures/{file}", content) for file, content in figure_files(name, figure).items())
+    for picture in pair_pictures(sources.workspace):
+        with suppress(NotRun):
+            figure = picture.figure()
+            yield from ((f"figures/{file}", content) for file, content in figure_files(picture.name, figure).items())
     parts = report_parts(sources, None)
     yield from report_files(sources.study, [(part.chapter, part.make()) for part in parts], None).items()
 

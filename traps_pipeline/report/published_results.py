@@ -53,11 +53,6 @@ def _rates(results: Results) -> pd.DataFrame:
     return table.reindex(columns=pd.Index(RATE_COLUMNS))
 
 
-def _empty_frame(*columns: str) -> pd.DataFrame:
-    """Return a frame without rows, for what the paper's tables do not determine."""
-    return pd.DataFrame(columns=pd.Index(columns))
-
-
 def _sub_scenarios(results: Results) -> pd.DataFrame:
     occlusion, chaotic = published("occlusion_subscenarios"), published("chaotic_subscenarios")
     table = concat_frames([occlusion.assign(dataset="occlusion"), chaotic.assign(dataset="chaotic")])
@@ -89,12 +84,12 @@ def _probes(results: Results) -> pd.DataFrame:
 def _cosines(results: Results) -> pd.DataFrame:
     """Return COSINES rows: qwen3-vl-8b's matrix, and other models' values in the text."""
     matrix = published("cosine_qwen").assign(model="qwen3-vl-8b")
-    other_figures = published("other")
-    other_figures = other_figures.loc[other_figures["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
-    pairs = other_figures["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
-    other_figures = other_figures.assign(source=pairs[0], other=pairs[1], cosine=other_figures["value"].astype(float))
-    mirrored_rows = other_figures.rename(columns={"source": "other", "other": "source"})
-    all_cosines = pd.concat([matrix, other_figures, mirrored_rows], ignore_index=True)
+    other_numbers = published("other")
+    other_numbers = other_numbers.loc[other_numbers["id"].str.fullmatch(r"cos-(gemma|llava)-\w+-\w+")]
+    pairs = other_numbers["id"].str.split("-", n=2).str[2].str.split("-", expand=True)
+    other_numbers = other_numbers.assign(source=pairs[0], other=pairs[1], cosine=other_numbers["value"].astype(float))
+    mirrored_rows = other_numbers.rename(columns={"source": "other", "other": "source"})
+    all_cosines = pd.concat([matrix, other_numbers, mirrored_rows], ignore_index=True)
     all_cosines = _long(all_cosines).rename(columns={"source": "dataset", "other": "other_dataset"})
     return _as(
         COSINES, [all_cosines.assign(layer=_steered_layers(all_cosines), prompt="standard", other_prompt="standard")]
@@ -136,13 +131,8 @@ class PublishedResults(Results):
     cells = cached_property(_cells)
     overall = cached_property(_overall)
     rates = cached_property(_rates)
-    sub_cells = cached_property(
-        lambda results: _empty_frame("model", "dataset", "regime", "scope", "abs_rec", "n_pairs")
-    )
     sub_scenarios = cached_property(_sub_scenarios)
-    labels = cached_property(lambda results: _empty_frame("dataset", "sub_scenario", "label", "acc"))
     confabulation = cached_property(_confabulation)
-    composition = cached_property(lambda results: _empty_frame("taxonomy", "category", "void", "n", "n_ill_posed"))
     probes = cached_property(_probes)
     cosines = cached_property(_cosines)
     effects = cached_property(_effects)

@@ -1,6 +1,6 @@
 """Prepare the frames behind tables and figures, for a study or the paper.
 
-A frame without rows means that its part was not run. Shares are fractions; every frame with figures has a column
+A frame without rows means that its part was not run. Shares are fractions; every frame with metrics has a column
 `epoch`.
 """
 
@@ -24,7 +24,7 @@ from traps_pipeline.mechanism.control_rows import (
     STEERING_NULLS,
     STEERING_PECS,
 )
-from traps_pipeline.mechanism.mechanism_rows import PROBES, STEERING_SHARES
+from traps_pipeline.mechanism.mechanism_rows import COSINES, PROBES, STEERING_EFFECTS, STEERING_SHARES
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT
 from traps_pipeline.people.human_score_rows import CORRECTED, HUMAN_ROW, PANEL_ERRORS
 from traps_pipeline.protocol.datasets import DATASETS
@@ -64,13 +64,9 @@ SUB_COLUMNS = (
 TEXTUAL_COLUMNS = ("ill_posed_n_models", "abs_rec_ill_posed", "textual_over_visual", "n_missing")
 
 
-def own(what: str) -> cached_property[pd.DataFrame]:
-    """Declare a frame of `what` that each kind of results must override."""
-
-    def make(results: Results) -> pd.DataFrame:
-        raise NotImplementedError(f"{type(results).__name__} makes no frame with {what}")
-
-    return cached_property(make)
+def no_rows(columns: Iterable[str]) -> cached_property[pd.DataFrame]:
+    """Return a frame with these columns and without rows."""
+    return cached_property(lambda results: _empty_frame(columns))
 
 
 def table_frame(table: Table) -> cached_property[pd.DataFrame]:
@@ -81,7 +77,7 @@ def table_frame(table: Table) -> cached_property[pd.DataFrame]:
 class Results:
     """One set of results; a frame has no rows if its part was not run.
 
-    A new frame is an attribute here, made when first read, and where it is `own`, one of both kinds of results.
+    A new frame is an attribute here, made when first read; kinds of results that have it override `no_rows`.
     """
 
     source = ""  # in words, for titles
@@ -91,20 +87,20 @@ class Results:
     mechanism: MechanismSettings | None = None  # of a study that looks inside models
 
     board = table_frame(LEADERBOARD)
-    cells = own("CELL_COLUMNS, one row per (model, dataset, regime), averaged over runs.")
-    overall = own(
-        "One row per (model, regime) that has all four datasets: the columns of cells without dataset, and j; a study's"
-        " rows also have j_std, the intervals and ranks of LEADERBOARD. epoch joins the datasets' epochs by +."
-    )
-    rates = own("RATE_COLUMNS: visual and textual AbsRec under standard, one row per model and taxonomy (or pooled).")
-    sub_scenarios = own("SUB_COLUMNS: means over models, one row per sub-scenario.")
-    sub_cells = own("One row per (model, dataset, regime) and sub-scenario (column scope).")
+    cells = no_rows(CELL_COLUMNS)  # one row per (model, dataset, regime), averaged over runs
+    # One row per (model, regime) that has all four datasets. A study's rows also have j_std, the intervals and ranks of
+    # LEADERBOARD. epoch joins the datasets' epochs by +.
+    overall = no_rows([*(name for name in CELL_COLUMNS if name != "dataset"), "j"])
+    rates = no_rows(RATE_COLUMNS)  # visual and textual AbsRec under standard, by model and taxonomy (or pooled)
+    sub_scenarios = no_rows(SUB_COLUMNS)  # means over models, one row per sub-scenario
+    # One row per (model, dataset, regime) and sub-scenario (column scope).
+    sub_cells = no_rows(["model", "dataset", "regime", "scope", "abs_rec", "n_pairs"])
     # Both without what ill-posed questions decide: a correction of one need not draw the heatmaps again.
     visual_sub_scenarios = cached_property(lambda results: results.sub_scenarios.drop(columns=[*TEXTUAL_COLUMNS]))
     visual_sub_cells = cached_property(
         lambda results: results.sub_cells.loc[results.sub_cells["dataset"].isin(TAXONOMIES)]
     )
-    labels = own("Mean Acc over models by the control's answer: dataset, sub_scenario, label, acc, n_pairs, n_models.")
+    labels = no_rows(["dataset", "sub_scenario", "label", "acc"])  # mean Acc over models by the control's answer
     agreement = table_frame(AGREEMENT)
     bias = table_frame(JUDGE_BIAS)
     leave_one_out = table_frame(LEAVE_ONE_OUT)
@@ -119,13 +115,13 @@ class Results:
     human_agreement = table_frame(HUMAN_AGREEMENT)
     panel_errors = table_frame(PANEL_ERRORS)
     corrected = table_frame(CORRECTED)
-    composition = own("taxonomy, category, void, n (well-posed pairs), n_ill_posed.")
+    composition = no_rows(["taxonomy", "category", "void", "n", "n_ill_posed"])  # n: well-posed pairs
     prompted_probes = table_frame(PROBES)  # under every prompt
     prompted_baselines = table_frame(PROBE_BASELINES)  # under every prompt
     # PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.
     probes = cached_property(lambda results: _probe_prompt_rows(results.prompted_probes))
-    cosines = own("COSINES rows at the steered layer of each model.")
-    effects = own("STEERING_EFFECTS rows of the paper's protocol: void directions, doses in alpha, signs by label.")
+    cosines = no_rows(COSINES.names)  # at the steered layer of each model
+    effects = no_rows(STEERING_EFFECTS.names)  # of void directions, doses in alpha, signs by label
     baselines = cached_property(lambda results: _probe_prompt_rows(results.prompted_baselines))
     gate = table_frame(GATE)
     patching = table_frame(PATCHING)
@@ -144,14 +140,12 @@ class Results:
 
     def __init__(self) -> None:
         self.kept: dict[str, list[PrintedTable]] = {}  # the tables of the catalogue that were made of them, by name
-        # The reasons, by analysis, why figures were not computed: their sides are of different epochs.
+        # The reasons, by analysis, why metrics were not computed: their sides are of different epochs.
         self.refused: dict[str, list[str]] = {}
 
     def rows(self, table: Table) -> pd.DataFrame:
         """Return all rows of a table of a study; for the paper, a frame without rows."""
-        import pandas as pd
-
-        return pd.DataFrame(columns=pd.Index([column.name for column in table.columns]))
+        return _empty_frame(table.names)
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
         """Return why two entries (model, regime) are not comparable on a dataset, or None."""
@@ -168,6 +162,12 @@ class Results:
         return "; ".join(self.refused.get(what, [])) or (
             "this study has no such results yet" if self.is_study else "the paper prints no such table"
         )
+
+
+def _empty_frame(columns: Iterable[str]) -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame(columns=pd.Index([*columns]))
 
 
 def _probe_prompt_rows(rows: pd.DataFrame) -> pd.DataFrame:

@@ -70,15 +70,15 @@ def _best(rows: pd.DataFrame) -> Iterator[StudyFinding]:
     for regime in [name for name in REGIMES if name in {*rows["regime"]}]:
         part = rows.loc[rows["regime"] == regime].sort_values(["pecs", "model"], ascending=[False, True])
         first = part.to_dict("records")[0]
-        figure = fraction(first["pecs"])
+        highest = fraction(first["pecs"])
         equal, worse_rows = (
-            [*part.loc[part["pecs"].map(fraction).eq(figure) == is_equal, "model"]] for is_equal in (True, False)
+            [*part.loc[part["pecs"].map(fraction).eq(highest) == is_equal, "model"]] for is_equal in (True, False)
         )
         best = (
             "have the highest PECS," if len(equal) > 1 else "has the highest PECS," if worse_rows else "has a PECS of"
         )
         group = "" if _noun(part) == "models" else f" among {_noun(part)}"
-        text = f"Under {regime},{group} {_names(equal)} {best} {figure} {interval(first)}".strip()
+        text = f"Under {regime},{group} {_names(equal)} {best} {highest} {interval(first)}".strip()
         if worse_rows:
             text += (
                 f", before {worse_rows[0]} with {fraction(part.loc[part['model'] == worse_rows[0], 'pecs'].iloc[0])}"
@@ -151,7 +151,7 @@ def _gaps(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
 
 
 def _two_events(results: Results) -> Iterator[StudyFinding]:
-    """Yield the most specific entry's figures of two events."""
+    """Yield the most specific entry's metrics of two events."""
     rows = results.two_way
     rows = _models_first(rows.dropna(subset=["specificity"])) if len(rows) else rows
     if len(rows):
@@ -170,7 +170,7 @@ def _separable(results: Results, rows: pd.DataFrame) -> Iterator[StudyFinding]:
     if len(contrasts):
         models = contrasts["left_model"].isin(rows["model"]) & contrasts["right_model"].isin(rows["model"])
         is_comparison = (
-            contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["figure"].eq("pecs")
+            contrasts["kind"].eq("models") & contrasts["dataset"].eq("overall") & contrasts["metric"].eq("pecs")
         )
         tested = contrasts.loc[models & is_comparison & contrasts["difference"].notna()]
         if len(tested):

@@ -11,11 +11,11 @@ TITLE_OF = {
     "chaotic": "Chaotic",
     "chaotic_ill_posed": "Chaotic, ill-posed",
 }
-# Neither arms nor variations enter a figure of the pairs.
+# Neither arms nor variations enter a metric of the pairs.
 ARM_TITLES = {arm: f"Arm: {arm.replace('_', ' ')}" for arm in ARMS}
 ARM_TITLES |= {TWO_EVENTS: "Two events", GRADED: "Graded cuts"}
 ARM_TITLES |= {name: f"Variation: {name.replace('_', ' ')}" for name in VARIATIONS}
-# Headings and meanings of the figures of two events on the leaderboard (docs/scoring.md, "Two events").
+# Headings and meanings of the metrics of two events on the leaderboard (docs/scoring.md, "Two events").
 TWO_WAY_MEANINGS = {
     "Conjunction %": "share of scenarios of two events with all eight items right; 0 for every rule of clip or "
     "question alone, for always and for never abstaining",

@@ -1,7 +1,7 @@
 """Write tables and figures in all formats, with the same bytes on every build.
 
-A `PrintedTable` is a frame of numbers with printed columns; it becomes Parquet and CSV (unrounded numbers), LaTeX,
-Markdown, text for a terminal and HTML (printed numbers). Its texts are untrusted: each medium escapes them.
+A `PrintedTable` is a frame of numbers with printed columns; it becomes CSV (unrounded numbers), LaTeX, Markdown,
+text for a terminal and HTML (printed numbers). Its texts are untrusted: each medium escapes them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ TEMPLATES = Path(__file__).parent / "templates"
 STYLE = ASSETS / "figures.mplstyle"
 NOT_RUN = "not run"
 REFERENCE_ROWS = "Reference rows"  # of strategies and rules, which no text calls models
-TABLE_KINDS = ("parquet", "csv", "tex", "md")
 FIGURE_KINDS = ("pdf", "svg", "png")
 
 COLUMN_IN, PAGE_IN = 3.3, 6.8  # widths of a figure of one column, and of two
@@ -67,7 +66,7 @@ Trace = Callable[[Mapping[str, Any], str], SourceItems | None]  # row and field 
 
 
 def fraction(value: float | None, digits: int = 3) -> str:
-    """Return a figure as printed, with a typographic minus sign; a dash for null."""
+    """Return a number as printed, with a typographic minus sign; a dash for null."""
     import pandas as pd
 
     if value is None or pd.isna(value):
@@ -125,13 +124,13 @@ class Column:
             return value or "", "", ""
         if self.unit in ("text", "range"):
             return "" if value is None or value is pd.NA or value != value else plain(value), "", ""
-        figure = self._number(value)
+        printed = self._number(value)
         low, high = (self._number(row.get(f"{self.field}_ci_{end}")) for end in ("low", "high"))
-        if self.interval and NONE not in (figure, low):
-            figure += f" [{low}, {high}]"
-        spread = self._number(row.get(self.spread)) if self.spread and figure != NONE else NONE
+        if self.interval and NONE not in (printed, low):
+            printed += f" [{low}, {high}]"
+        spread = self._number(row.get(self.spread)) if self.spread and printed != NONE else NONE
         mark = row.get(self.mark) if self.mark else ""
-        return figure, "" if spread == NONE else spread, plain(mark) if isinstance(mark, str) and mark else ""
+        return printed, "" if spread == NONE else spread, plain(mark) if isinstance(mark, str) and mark else ""
 
     def _number(self, value: Any) -> str:
         digits = DIGITS[self.unit] if self.digits is None else self.digits
@@ -141,8 +140,8 @@ class Column:
 
 
 def _joined(parts: tuple[str, str, str]) -> str:
-    figure, spread, mark = parts
-    return figure + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
+    printed, spread, mark = parts
+    return printed + (f" ± {spread}" if spread else "") + (f" {mark}" if mark else "")
 
 
 @dataclass(frozen=True)
@@ -224,14 +223,12 @@ class PrintedTable:
 
 
 def table_files(table: PrintedTable) -> dict[str, bytes]:
-    """Return a table's files: `name.parquet`, `.csv` (fractions), `.tex` and `.md`."""
-    files = {
-        "parquet": _parquet(table),
-        "csv": csv_bytes(table.data),
-        "tex": table_latex(table).encode(),
-        "md": table_markdown(table).encode(),
+    """Return a table's files: `name.csv` (fractions), `.tex` and `.md`."""
+    return {
+        f"{table.name}.csv": csv_bytes(table.data),
+        f"{table.name}.tex": table_latex(table).encode(),
+        f"{table.name}.md": table_markdown(table).encode(),
     }
-    return {f"{table.name}.{kind}": files[kind] for kind in TABLE_KINDS}
 
 
 def table_markdown(table: PrintedTable) -> str:
@@ -290,9 +287,9 @@ def table_latex(table: PrintedTable) -> str:
 def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None = None) -> str:
     """Return a table in a scrolling box with notes; `address`: link to the items."""
 
-    def link(row: Mapping[str, Any], column: Column, figure: str) -> str | None:
-        is_figure = column.is_number and figure not in ("", NONE)
-        trace = table.trace(row, column.field) if is_figure and table.trace and address else None
+    def link(row: Mapping[str, Any], column: Column, printed: str) -> str | None:
+        is_known = column.is_number and printed not in ("", NONE)
+        trace = table.trace(row, column.field) if is_known and table.trace and address else None
         return address(trace) if trace and address else None
 
     columns = [
@@ -333,23 +330,6 @@ def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
 def markdown(text: object) -> str:
     """Return the text escaped as neither HTML nor markup, within its table cell."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
-
-
-def _parquet(table: PrintedTable) -> bytes:
-    """Return the Parquet file; text columns keep type text even if all is null."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    data = table.data
-    texts = {c.field for c in table.columns if c.unit in ("text", "range")}
-    object_columns = [str(name) for name, kind in data.dtypes.items() if kind.kind == "O" and str(kind) == "object"]
-    numeric = {name for name in object_columns if name not in texts and not any(isinstance(v, str) for v in data[name])}
-    data = data.astype({name: "Float64" if name in numeric else "string" for name in object_columns})
-    arrow = pa.Table.from_pandas(data, preserve_index=False)
-    metadata = {"title": table.title, "notes": "\n".join(table.remarks), "absence": table.absence}
-    stream = io.BytesIO()
-    pq.write_table(arrow.replace_schema_metadata(metadata), stream, compression="zstd")
-    return stream.getvalue()
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@
 abs_rec, false_abs, pecs (fractions) and epoch; `study_cells` makes it from a study, `published.published_cells` from
 the paper. The input may hold further columns and is never changed. A ratio or gap whose two sides are of different
 epochs raises `epochs.EpochMismatch`; a mean over datasets takes each dataset in its own epoch, the same on both sides.
-A mean is null if one of its values is null. A mean over models uses the models that have every figure it needs.
+A mean is null if one of its values is null. A mean over models uses the models that have every metric it needs.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
     """Return rows not dominated in acc and j within their regime, by decreasing Acc.
 
-    A model dominates another if it is at least as good in both figures and better in one. Two equal models are both on
+    A model dominates another if it is at least as good in both metrics and better in one. Two equal models are both on
     the frontier; a model without Acc or J is not on it.
     """
     import pandas as pd
@@ -168,7 +168,7 @@ def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def degenerate_strategies() -> pd.DataFrame:
-    """Return expected figures of strategies that do not discriminate.
+    """Return expected metrics of strategies that do not discriminate.
 
     Columns strategy, acc, false_abs, abs_rec, j, pecs, naive. acc is null where the strategy does not determine it;
     PECS is still 0, since J is not above 0.
@@ -259,7 +259,7 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
     pecs under standard, over n_models models; these with the prefix guided_, over guided_n_models; abs_rec_uplift and
     false_abs_uplift (guided minus standard), over the uplift_n_models that have both; abs_rec_ill_posed (standard) and
     textual_over_visual, over the ill_posed_n_models that have both; n_missing, the missing items of all cells used. A
-    model with a null figure is left out of the group of means that needs it. A mean is null if its regime or dataset
+    model with a null metric is left out of the group of means that needs it. A mean is null if its regime or dataset
     was not run.
     """
     import pandas as pd

@@ -1,7 +1,7 @@
 """Compute confidence intervals of scores by a Bayesian bootstrap over scenarios.
 
 See docs/scoring.md, "Intervals", and docs/design/intervals.md. All cells of a taxonomy share one weight matrix over
-scenarios. Every resample is computed twice: with one unseen scenario in each share that is the worst for the figure
+scenarios. Every resample is computed twice: with one unseen scenario in each share that is the worst for the metric
 (its lower end), and with one that is the best (its upper end).
 """
 
@@ -21,7 +21,7 @@ from traps_pipeline.scoring.metrics import COUNTS, decision_counts
 TAXONOMIES = ("occlusion", "chaotic")
 ENTRY = ["model", "regime", "dataset"]
 RESAMPLED_METRICS = tuple(METRIC_WORDS)
-INTERVAL_COLUMNS = [f"{figure}_ci_{end}" for figure in RESAMPLED_METRICS for end in ("low", "high")]
+INTERVAL_COLUMNS = [f"{metric}_ci_{end}" for metric in RESAMPLED_METRICS for end in ("low", "high")]
 RESAMPLES, SEED = 10_000, 20260101
 _GRAIN = 256  # weights are multiples of 1/256, so that float32 sums of them are exact on every machine
 _LEVEL = 0.95
@@ -29,8 +29,8 @@ _IN_MEAN = 0.5**0.5  # of two taxonomies: their errors are independent, so squar
 
 
 @dataclass(frozen=True)
-class ResampledFigures:
-    """The mean over runs of every figure, observed and in every resample.
+class ResampledMetrics:
+    """The mean over runs of every metric, observed and in every resample.
 
     entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED_METRICS) float64; values:
     (entries, 2, RESAMPLED_METRICS, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
@@ -41,19 +41,19 @@ class ResampledFigures:
     observed: np.ndarray
     values: np.ndarray
 
-    def figure(self, name: str) -> np.ndarray:
-        """Return the ends of one figure: (entries, 2, resamples)."""
+    def metric(self, name: str) -> np.ndarray:
+        """Return the ends of one metric: (entries, 2, resamples)."""
         return self.values[:, :, RESAMPLED_METRICS.index(name)]
 
 
-def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledFigures:
+def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledMetrics:
     """Resample every (model, regime) on each of its datasets, and overall.
 
-    Overall is the equal-weight mean over the four datasets, over the runs that have all four. Figures are computed per
+    Overall is the equal-weight mean over the four datasets, over the runs that have all four. Metrics are computed per
     run, then averaged.
 
     Memory: one float32 weight matrix (resamples, scenarios) per taxonomy, one (resamples, 6 x cells) product of a
-    single model and regime, and the result: 400 kB per entry and figure at 10,000 resamples over four datasets.
+    single model and regime, and the result: 400 kB per entry and metric at 10,000 resamples over four datasets.
     """
     items = pd.concat(
         [verdicts[["model", "regime", "dataset", "run", "scenario_id"]], decision_counts(verdicts)], axis=1
@@ -73,14 +73,14 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
                 values[len(entries)] = mean[..., 1:]
                 observed.append(mean[1, :, 0])
                 entries.append((model, regime, dataset))
-    figures = np.array(observed).reshape(len(entries), len(RESAMPLED_METRICS))
-    return ResampledFigures(entries, figures, values[: len(entries)])
+    metrics = np.array(observed).reshape(len(entries), len(RESAMPLED_METRICS))
+    return ResampledMetrics(entries, metrics, values[: len(entries)])
 
 
-def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFrame:
+def intervals(resampled: ResampledMetrics, level: float = _LEVEL) -> pd.DataFrame:
     """Return 95 % intervals (ENTRY, INTERVAL_COLUMNS) by entry, null where undecided."""
     ends = [
-        interval(resampled.figure(name), resampled.observed[:, k], limits_of(name), level)
+        interval(resampled.metric(name), resampled.observed[:, k], limits_of(name), level)
         for k, name in enumerate(RESAMPLED_METRICS)
     ]
     table = pd.DataFrame(resampled.entries, columns=pd.Index(ENTRY))
@@ -88,9 +88,9 @@ def intervals(resampled: ResampledFigures, level: float = _LEVEL) -> pd.DataFram
     return pd.concat([table, pd.DataFrame(bounds, columns=pd.Index(INTERVAL_COLUMNS))], axis=1)
 
 
-def limits_of(figure: str) -> tuple[float, float]:
+def limits_of(metric: str) -> tuple[float, float]:
     """Return the minimum and maximum of a score: [-1, 1] for J, [0, 1] for most others."""
-    return (METRIC_WORDS[figure].lowest if figure in METRIC_WORDS else 0.0), 1.0
+    return (METRIC_WORDS[metric].lowest if metric in METRIC_WORDS else 0.0), 1.0
 
 
 def interval(
@@ -146,7 +146,7 @@ def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> n
 class Resampling:
     """Weights of scenarios in every resample.
 
-    The first draw takes each scenario once and no unseen one, and so gives the figures themselves. scenarios: by
+    The first draw takes each scenario once and no unseen one, and so gives the metrics themselves. scenarios: by
     taxonomy its scenarios (n,) and their weights (1 + resamples, n) float32: exponential with mean 1, positive.
     """
 
@@ -154,12 +154,12 @@ class Resampling:
     resamples: int
     seed: int
 
-    def unseen(self, figures_of: str, decisions: int) -> np.ndarray:
+    def unseen(self, named: str, decisions: int) -> np.ndarray:
         """Return the bootstrap weights of a scenario met for the first time, (decisions, 1 + resamples) float64.
 
         They are the same for the same name, and independent for two names.
         """
-        rng = np.random.default_rng([self.seed, len(TAXONOMIES), crc32(figures_of.encode())])
+        rng = np.random.default_rng([self.seed, len(TAXONOMIES), crc32(named.encode())])
         return np.concatenate([np.zeros((decisions, 1)), rng.standard_exponential((decisions, self.resamples))], axis=1)
 
 
@@ -230,10 +230,10 @@ def metrics_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
     The sums are those of COUNTS with an unseen scenario. in_mean: as in `shares_of`.
     """
-    return figures_of_shares(shares_of(sums, in_mean))
+    return metrics_of_shares(shares_of(sums, in_mean))
 
 
-def figures_of_shares(shares: np.ndarray) -> np.ndarray:
+def metrics_of_shares(shares: np.ndarray) -> np.ndarray:
     """Return scores, (2, .., 3, resamples) -> (2, .., RESAMPLED_METRICS, resamples).
 
     The three are the ends of Acc, FalseAbs and AbsRec.
@@ -273,21 +273,21 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
 
 
 def means_over_runs(
-    sums: Mapping[tuple[str, int], np.ndarray], figures: Callable[[np.ndarray, bool], np.ndarray], draws: int
+    sums: Mapping[tuple[str, int], np.ndarray], compute: Callable[[np.ndarray, bool], np.ndarray], draws: int
 ) -> dict[str, np.ndarray]:
     """Return dataset or `overall` -> mean over runs (2, RESAMPLED_METRICS, draws).
 
-    sums: the `run_sums` of (dataset, run). figures: the function (`metrics_of`) that computes figures from them.
+    sums: the `run_sums` of (dataset, run). compute: the function (`metrics_of`) that computes metrics from them.
     """
     runs = sorted({run for _, run in sums})
     means = {
-        dataset: _mean([figures(sums[dataset, run], False) for run in runs if (dataset, run) in sums])
+        dataset: _mean([compute(sums[dataset, run], False) for run in runs if (dataset, run) in sums])
         for dataset in DATASETS
         if any((dataset, run) in sums for run in runs)
     }
     complete_runs = [sums[d, run] for run in runs if all((d, run) in sums for d in DATASETS) for d in DATASETS]
     undefined = np.full((2, len(RESAMPLED_METRICS), draws), np.nan)
-    return {**means, "overall": _mean([figures(own, True) for own in complete_runs]) if complete_runs else undefined}
+    return {**means, "overall": _mean([compute(own, True) for own in complete_runs]) if complete_runs else undefined}
 
 
 def _mean(values: Sequence[np.ndarray]) -> np.ndarray:

@@ -21,7 +21,7 @@ from traps_pipeline.scoring.bootstrap import (
     ENTRY,
     RESAMPLED_METRICS,
     RESAMPLES,
-    ResampledFigures,
+    ResampledMetrics,
     difference,
     interval,
     limits_of,
@@ -35,17 +35,17 @@ from traps_pipeline.scoring.standings import means_over_runs, standings
 CONTRASTED_METRICS = ("pecs", "j")
 SEPARABLE_BELOW = 0.05
 VERSION_SIDES = ("n_missing", "epoch", "benchmark_version")  # columns that `version_contrasts` has for each side
-_FAMILY = ["kind", "dataset", "figure", "_regime"]
+_FAMILY = ["kind", "dataset", "metric", "_regime"]
 _SIDE_COLUMNS = (("left_model", "left_regime"), ("right_model", "right_regime"))
 _SIDES = [column for columns in _SIDE_COLUMNS for column in columns]
 _AT_ONCE = 16  # paired differences whose resamples are in memory at once: so few that their memory is used again
 _Side = tuple[str, str]  # model, regime
 
 
-def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
+def contrasts(resampled: ResampledMetrics, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
     """Return CONTRASTS rows, from the bootstrap and the rows behind it.
 
-    METRICS rows give the figures, VERDICTS rows the items and epochs. The rows compare every pair of models under each
+    METRICS rows give the means, VERDICTS rows the items and epochs. The rows compare every pair of models under each
     regime and every pair of regimes of each model, in PECS and in J, on each dataset, and overall if both sides have a
     run of all four.
     """
@@ -60,17 +60,17 @@ def contrasts(resampled: ResampledFigures, metrics: pd.DataFrame, verdicts: pd.D
             "refused": refusal_reason,
         }
         row |= dict(zip(_SIDES, (*left, *right), strict=True))
-        rows += [{**row, "figure": figure} for figure in CONTRASTED_METRICS]
+        rows += [{**row, "metric": metric} for metric in CONTRASTED_METRICS]
     places = {entry: row for row, entry in enumerate(resampled.entries)}
     means = means_over_runs(metrics).loc[:, [*CONTRASTED_METRICS]].to_dict("index")
-    for figure in CONTRASTED_METRICS:
-        compared_rows = [row for row in rows if row["figure"] == figure and row["refused"] is None]
+    for metric in CONTRASTED_METRICS:
+        compared_rows = [row for row in rows if row["metric"] == metric and row["refused"] is None]
         for first in range(0, len(compared_rows), _AT_ONCE):
             part = compared_rows[first : first + _AT_ONCE]
             sides = [[(row[model], row[regime], row["dataset"]) for row in part] for model, regime in _SIDE_COLUMNS]
-            draws = [resampled.figure(figure)[[places[entry] for entry in side]] for side in sides]
-            observed = [[means.get(entry, {}).get(figure, np.nan) for entry in side] for side in sides]
-            row_differences = _differences(figure, draws, observed, [sizes[entry] for entry in sides[0]])
+            draws = [resampled.metric(metric)[[places[entry] for entry in side]] for side in sides]
+            observed = [[means.get(entry, {}).get(metric, np.nan) for entry in side] for side in sides]
+            row_differences = _differences(metric, draws, observed, [sizes[entry] for entry in sides[0]])
             for row, columns in zip(part, row_differences, strict=True):
                 row |= columns
     table = pd.DataFrame(rows, columns=pd.Index([*CONTRASTS.names, "_regime"]))
@@ -83,7 +83,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     """Return the change between two studies (or versions) on their common pairs.
 
     The change is now minus then; both are VERDICTS rows. A pair that is incomplete in either study, in the same run and
-    cell, is left out. Columns: model, regime, dataset (and `overall`), figure, n_pairs per run, n_scenarios, then, now,
+    cell, is left out. Columns: model, regime, dataset (and `overall`), metric, n_pairs per run, n_scenarios, then, now,
     difference, ci_low, ci_high, p, p_holm, separable, VERSION_SIDES with the suffixes _then and _now, and refused: the
     reason for a missing difference, if an item was answered in different epochs. Raises TrapsError if the two studies
     share no complete pair.
@@ -93,33 +93,33 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
         raise TrapsError("the two studies share no whole pair of the same model, regime and run")
     boards = [_standings(rows).add_suffix(suffix) for rows, suffix in zip(sides, ("_then", "_now"), strict=True)]
     board = boards[0].join(boards[1], how="inner").rename(columns={"n_pairs_now": "n_pairs"})
-    items_of, resampled_figures = (
+    items_of, resampled_metrics = (
         [answered_items(rows) for rows in sides],
         [resample(rows, resamples) for rows in sides],
     )
-    draws = [dict(zip(side_figures.entries, side_figures.values, strict=True)) for side_figures in resampled_figures]
+    draws = [dict(zip(side_metrics.entries, side_metrics.values, strict=True)) for side_metrics in resampled_metrics]
     sizes = _scenarios(sides[1])
     rows = []
     for entry, entry_columns in board.to_dict("index").items():
         refusal_reason = refusal(items_of[0][entry], items_of[1][entry])
-        for figure in CONTRASTED_METRICS:
+        for metric in CONTRASTED_METRICS:
             values = {
                 f"{name}_{side}": entry_columns[f"{name}_{side}"] for name in VERSION_SIDES for side in ("then", "now")
             }
-            values |= {side: entry_columns[f"{figure}_{side}"] for side in ("then", "now")}
+            values |= {side: entry_columns[f"{metric}_{side}"] for side in ("then", "now")}
             row = dict(zip(ENTRY, entry, strict=True)) | {
-                "figure": figure,
+                "metric": metric,
                 "n_pairs": entry_columns["n_pairs"],
                 **values,
             }
             row["n_scenarios"] = sizes[entry]
             if refusal_reason is None:
-                ends = [side_figures[entry][None, :, RESAMPLED_METRICS.index(figure)] for side_figures in draws[::-1]]
-                row |= _differences(figure, ends, [[row["now"]], [row["then"]]], [sizes[entry]])[0]
+                ends = [side_metrics[entry][None, :, RESAMPLED_METRICS.index(metric)] for side_metrics in draws[::-1]]
+                row |= _differences(metric, ends, [[row["now"]], [row["then"]]], [sizes[entry]])[0]
             rows.append(row | {"refused": refusal_reason})
     columns = [
         *ENTRY,
-        "figure",
+        "metric",
         "n_pairs",
         "n_scenarios",
         "then",
@@ -132,7 +132,7 @@ def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RE
     ]
     columns += ["separable"] + [f"{name}_{side}" for name in VERSION_SIDES for side in ("then", "now")] + ["refused"]
     table = pd.DataFrame(rows, columns=pd.Index(columns))
-    family = ["dataset", "figure"]
+    family = ["dataset", "metric"]
     table["p_holm"] = _holm_by(table, family)
     table["separable"] = _separable(table, family)
     return table
@@ -244,7 +244,7 @@ def _scenarios(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], int]:
 
 
 def _differences(
-    figure: str, sides: Sequence[np.ndarray], observed: Sequence[Sequence[float]], scenarios: Sequence[int]
+    metric: str, sides: Sequence[np.ndarray], observed: Sequence[Sequence[float]], scenarios: Sequence[int]
 ) -> list[dict[str, float]]:
     """Return the columns of n paired differences, each over its number of scenarios: interval and two-sided p.
 
@@ -252,7 +252,7 @@ def _differences(
     p.
     """
     ends, apart = difference(*sides), np.asarray(observed[0]) - np.asarray(observed[1])
-    minimum, maximum = limits_of(figure)
+    minimum, maximum = limits_of(metric)
     bounds = interval(ends, apart, (minimum - maximum, maximum - minimum))
     rows = []
     for size, value, bound, (lower, upper) in zip(scenarios, apart, bounds, ends, strict=True):

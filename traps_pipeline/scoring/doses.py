@@ -1,7 +1,7 @@
 """Test how abstention changes as one property of the pairs changes by steps.
 
 See docs/hypotheses.md. Each hypothesis has doses; the first is the reference for the others, on the scenarios that both
-have. Beside every figure of a model stands the score of shortcut rules, which read one cue and understand nothing, and
+have. Beside every metric of a model stands the score of shortcut rules, which read one cue and understand nothing, and
 the score of a guess.
 """
 
@@ -66,7 +66,7 @@ class Hypothesis:
     """A hypothesis on J or the share of abstentions; its first dose is the reference."""
 
     name: str
-    figure: Literal["j", "abstains"]
+    metric: Literal["j", "abstains"]
     doses: tuple[Dose, ...]
 
 
@@ -134,7 +134,7 @@ def hypotheses(
     """Return HYPOTHESES rows from the VERDICTS rows of DATASETS_READ.
 
     There is one row per model, regime, hypothesis and dose, if a dose other than the reference was run. offered: the
-    number of answers to choose from in each item's question, by item id. Figures are computed per run, then averaged;
+    number of answers to choose from in each item's question, by item id. Metrics are computed per run, then averaged;
     their intervals resample scenarios, each with all its doses.
     """
     items = pd.concat([verdicts[_ITEM_COLUMNS], decision_counts(verdicts)], axis=1)
@@ -170,7 +170,7 @@ def _row(
     """Return the columns of a dose's row, except those of rules."""
     model, regime = (items[name].iloc[0] for name in ("model", "regime"))
     row_name = f"{model}|{regime}|{hypothesis.name}"
-    figures = _figures(items, resampling, f"{row_name}|{dose.name}")
+    metrics = _metrics(items, resampling, f"{row_name}|{dose.name}")
     control = items["side"].eq("control").to_numpy()
     is_decided = np.where(control, items["correct_of"] & items["false_abs_of"], items["abs_rec_of"])
     row: dict[str, Any] = {
@@ -180,7 +180,7 @@ def _row(
         "n_scenarios": items["scenario_id"].nunique(),
         "n_items": items["item_id"].nunique(),
         "n_missing": int(len(items) - is_decided.sum()),
-        "compared": hypothesis.figure,
+        "compared": hypothesis.metric,
         "chance": float((1 / items.loc[control, "offered"]).mean()) if control.any() else None,
         "panel": joined_epochs(items["panel"]),
         "epoch": joined_epochs(items["epoch"]),
@@ -191,8 +191,8 @@ def _row(
         **dict.fromkeys(_ends("change")),
     }
     for name in SHARES:
-        row |= with_interval(name, figures[:, RESAMPLED_METRICS.index(name)], limits_of(name))
-    row["value"] = _compared_figure(hypothesis, figures)[1, 0]
+        row |= with_interval(name, metrics[:, RESAMPLED_METRICS.index(name)], limits_of(name))
+    row["value"] = _compared_metric(hypothesis, metrics)[1, 0]
     if dose is hypothesis.doses[0] or reference.empty:
         return row
     shared_items = reference.loc[reference["scenario_id"].isin(items["scenario_id"])]
@@ -203,7 +203,7 @@ def _row(
     if row["refused"] is None:
         names = (hypothesis.doses[0].name, dose.name)
         end_before, end_after = (
-            _compared_figure(hypothesis, _figures(rows, resampling, f"{row_name}|{name}"))
+            _compared_metric(hypothesis, _metrics(rows, resampling, f"{row_name}|{name}"))
             for rows, name in zip((shared_items, own_items), names, strict=True)
         )
         row |= {"n_compared": own_items["scenario_id"].nunique(), "at_reference": end_before[1, 0]}
@@ -211,22 +211,22 @@ def _row(
     return row
 
 
-def _figures(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
+def _metrics(items: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
     """Return ends of RESAMPLED_METRICS and of abstentions, (2, RESAMPLED_METRICS + 1, draws).
 
     They are computed over all items of a run, then averaged over runs.
     """
     sums = run_sums(items.assign(dataset="all"), resampling, named)
-    run_figures = []
+    run_metrics = []
     for sums_of_run in sums.values():
         rows = dict(zip(_SUMS, sums_of_run, strict=True))
         abstention_sums = [rows[f"false_abs{kind}"] + rows[f"abs_rec{kind}"] for kind in ("", "_of", "_unseen")]
-        run_figures.append(np.concatenate([metrics_of(sums_of_run), shares_of(np.stack(abstention_sums))], axis=1))
-    return np.mean(run_figures, axis=0)
+        run_metrics.append(np.concatenate([metrics_of(sums_of_run), shares_of(np.stack(abstention_sums))], axis=1))
+    return np.mean(run_metrics, axis=0)
 
 
-def _compared_figure(hypothesis: Hypothesis, figures: np.ndarray) -> np.ndarray:
-    return figures[:, -1] if hypothesis.figure == "abstains" else figures[:, RESAMPLED_METRICS.index("j")]
+def _compared_metric(hypothesis: Hypothesis, metrics: np.ndarray) -> np.ndarray:
+    return metrics[:, -1] if hypothesis.metric == "abstains" else metrics[:, RESAMPLED_METRICS.index("j")]
 
 
 def _ends(name: str) -> list[str]:
@@ -281,9 +281,9 @@ def wrong_rows(table: pd.DataFrame) -> int:
     """
     is_wrong = np.zeros(len(table), bool)
     for name in (*SHARES, "change"):
-        figure, low, high = (table[column].to_numpy(float) for column in _ends(name))
+        metric, low, high = (table[column].to_numpy(float) for column in _ends(name))
         minimum, maximum = _CHANGE if name == "change" else limits_of(name)
-        is_wrong |= (figure < minimum) | (figure > maximum) | (low > high) | (low < minimum) | (high > maximum)
+        is_wrong |= (metric < minimum) | (metric > maximum) | (low > high) | (low < minimum) | (high > maximum)
     columns = ("j", "abs_rec", "false_abs", "change", "value", "at_reference")
     j, abs_rec, false_abs, change, value, reference_value = (table[name].to_numpy(float) for name in columns)
     are_complete = (table["n_compared"] == table["n_scenarios"]).fillna(False).to_numpy(bool)

@@ -29,11 +29,11 @@ class EpochMismatch(TrapsError):
     """The two sides of a ratio, contrast or gap were evaluated in different campaigns."""
 
 
-def require_one_epoch(epochs: pd.DataFrame, figure: str) -> None:
+def require_one_epoch(epochs: pd.DataFrame, metric: str) -> None:
     """Raise EpochMismatch if any row of `epochs` holds two different epochs.
 
     epochs has one row per comparison (its index names it, e.g. model and dataset) and one column per side; a null side
-    is ignored. figure: its name in the message.
+    is ignored. metric: its name in the message.
     """
     mixed_rows = epochs.loc[epochs.nunique(axis=1) > 1]
     if mixed_rows.empty:
@@ -43,7 +43,7 @@ def require_one_epoch(epochs: pd.DataFrame, figure: str) -> None:
     sides = ", ".join(f"{side} from epoch {epoch!r}" for side, epoch in mixed_rows.iloc[0].dropna().items())
     suffix = f" (and {len(mixed_rows) - 1} more)" if len(mixed_rows) > 1 else ""
     raise EpochMismatch(
-        f"{figure}: {names} has {sides}{suffix}; metrics of different epochs are never put in one ratio, contrast or "
+        f"{metric}: {names} has {sides}{suffix}; metrics of different epochs are never put in one ratio, contrast or "
         "gap: evaluate both sides in one epoch, or leave this one out"
     )
 

@@ -1,7 +1,7 @@
 """Score answers to graded cuts against the true distribution over answers.
 
 See docs/scoring.md, "Graded cuts". A right answer earns 1 point, a wrong one costs WRONG_COSTS, an abstention earns
-nothing. The expected points of an answer follow from the posterior of its cut, so no figure here depends on which of
+nothing. The expected points of an answer follow from the posterior of its cut, so no metric here depends on which of
 the futures was filmed.
 """
 
@@ -113,12 +113,12 @@ def graded(
     for verdict in verdicts.to_dict("records"):
         key, item = tuple(verdict[name] for name in _ANSWER), questions[verdict["item_id"]]
         if "probabilities" in (fields_of(verdict["regime"]) or ()):
-            figures = _probability_figures(item, item.read_probabilities(texts.get(key)))
+            metrics = _probability_metrics(item, item.read_probabilities(texts.get(key)))
         elif BY_NAME[verdict["regime"]].first_token:
-            figures = _probability_figures(item, item.read_first_token(first_tokens.get(key)))
+            metrics = _probability_metrics(item, item.read_first_token(first_tokens.get(key)))
         else:
-            figures = _verdict_figures(item, verdict["abstained"], labels.get(key))
-        rows.append({**verdict, "taxonomy": "chaotic", "top": max(item.posterior.values()), **figures})
+            metrics = _verdict_metrics(item, verdict["abstained"], labels.get(key))
+        rows.append({**verdict, "taxonomy": "chaotic", "top": max(item.posterior.values()), **metrics})
     if not rows:
         return pd.DataFrame(columns=pd.Index(GRADED_CUTS.names))
     items = pd.DataFrame(rows).reindex(columns=[*verdicts.columns, "taxonomy", *_METRICS])
@@ -156,15 +156,15 @@ def _labels(votes: pd.DataFrame, questions: Mapping[str, GradedItem]) -> dict[tu
     return label_of
 
 
-def _verdict_figures(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
-    """Return the figures of a panel's decision; empty if it is undecided."""
+def _verdict_metrics(item: GradedItem, abstained: object, label: str | None) -> dict[str, float]:
+    """Return the metrics of a panel's decision; empty if it is undecided."""
     if pd.isna(cast(Any, abstained)) or (not abstained and label is None):
         return {}
     return answer_points(item, None if abstained else label)
 
 
-def _probability_figures(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
-    """Return the figures of stated probabilities; empty if there are none.
+def _probability_metrics(item: GradedItem, stated: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the metrics of stated probabilities; empty if there are none.
 
     The policy that acts on them gives the most probable answer, if its probability is at least ANSWER_FROM.
     """
@@ -246,7 +246,7 @@ def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, A
 def wrong_rows(table: pd.DataFrame) -> int:
     """Return how many GRADED_CUTS rows break their definition; null is not wrong.
 
-    A row is wrong if a figure lies outside its limits or its interval, or if a regret is not the sum of its parts or
+    A row is wrong if a metric lies outside its limits or its interval, or if a regret is not the sum of its parts or
     not the distance to the ideal.
     """
     is_wrong = (table["regret"] - table[[*PARTS]].sum(axis=1)).abs().to_numpy(float) > _ROUNDING

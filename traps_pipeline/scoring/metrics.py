@@ -22,7 +22,7 @@ BOUNDS = ["pecs_low", "pecs_high"]
 OUTCOMES = {"n_answered": JUDGED_OUTCOMES} | {c.name: c.outcomes for c in COUNT_WORDS.values() if c.outcomes}
 COUNT_COLUMNS = [*OUTCOMES, "n_not_json"]
 REJECTION_COLUMNS = [count.name for count in COUNT_WORDS.values() if count.is_of_decisions]
-# For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every figure is
+# For each decision, how often it was yes (numerator) and how often it was made (denominator, `_of`); every metric is
 # computed from these six counts.
 COUNTS = ["correct", "correct_of", "false_abs", "false_abs_of", "abs_rec", "abs_rec_of"]
 # The columns of each scope. A label belongs to a sub-scenario: the count 1 of one scene is not the bucket 1 of another.
@@ -68,8 +68,8 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     """Return METRICS rows of one dataset, from its VERDICTS rows.
 
     There is one row per cell and scope: `all`, `category:x`, `sub_scenario:x`, and `label:x/y` (y: the control's answer
-    in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Figures are
-    fractions; a figure whose denominator is 0 is null, and so is every figure computed from it. `n_missing` counts the
+    in the sub-scenario x; both sides of the pair); `scoped_by` (prefix to columns) may name fewer. Metrics are
+    fractions; a metric whose denominator is 0 is null, and so is every metric computed from it. `n_missing` counts the
     asked items that lack a decision: abstained or correct on a control, abstained on a void. BOUNDS show how far the
     missing decisions could move PECS; they are never null.
     Every share has its n and its Wilson interval.
@@ -87,7 +87,7 @@ def cell_metrics(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     sums["epoch"] = joined_in_groups(groups, "epoch", joined_epochs)
     sums["panel"] = joined_in_groups(groups, "panel", joined_epochs)
     sums["benchmark_version"] = joined_in_groups(groups, "benchmark_version", joined_versions)
-    return sums.assign(**_figures(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]
+    return sums.assign(**_metrics(sums), **_bounds(sums), **_wilson(sums)).reset_index().loc[:, METRICS.names]
 
 
 def joined_in_groups(groups: Any, column: str, joined: Callable[[Iterable[str]], str]) -> pd.Series:
@@ -137,11 +137,11 @@ def _with_scopes(verdicts: pd.DataFrame, scoped_by: Mapping[str, tuple[str, ...]
     return pd.concat([items.assign(scope=scope) for scope in scopes], ignore_index=True)
 
 
-def _figures(sums: pd.DataFrame) -> dict[str, np.ndarray]:
+def _metrics(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     """Return CELL_METRICS of every cell, (cells,) each."""
     acc, false_abs, abs_rec = (_share(sums, name) for name in ("correct", "false_abs", "abs_rec"))
-    figures = {name: metric.formula(acc, false_abs, abs_rec) for name, metric in METRIC_WORDS.items()}
-    return figures | {"naive": acc * abs_rec}
+    metrics = {name: metric.formula(acc, false_abs, abs_rec) for name, metric in METRIC_WORDS.items()}
+    return metrics | {"naive": acc * abs_rec}
 
 
 def _bounds(sums: pd.DataFrame) -> dict[str, np.ndarray]:
@@ -174,10 +174,10 @@ def wilson(yes: np.ndarray, of: np.ndarray, z: float = 1.959963984540054) -> tup
 def _wilson(sums: pd.DataFrame) -> dict[str, np.ndarray]:
     """Return the denominator of each share, and the share's interval: (cells,) each."""
     columns = {}
-    for figure, name in (("acc", "correct"), ("false_abs", "false_abs"), ("abs_rec", "abs_rec")):
+    for metric, name in (("acc", "correct"), ("false_abs", "false_abs"), ("abs_rec", "abs_rec")):
         totals = sums[f"{name}_of"].to_numpy("int64")
         low, high = wilson(sums[name].to_numpy(float), totals.astype(float))
-        columns |= {f"n_{figure}": totals, f"{figure}_low": low, f"{figure}_high": high}
+        columns |= {f"n_{metric}": totals, f"{metric}_low": low, f"{metric}_high": high}
     return columns
 
 
@@ -187,11 +187,11 @@ def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
     return sums[name].to_numpy(float) / np.where(totals > 0, totals, np.nan)
 
 
-def wrong_figures(cells: pd.DataFrame) -> int:
-    """Return how many figures of METRICS rows break their definition.
+def wrong_metrics(cells: pd.DataFrame) -> int:
+    """Return how many metrics of METRICS rows break their definition.
 
-    A figure is wrong if it is a share or bound outside [0, 1], or a PECS that is not Acc x max(0, J) or lies outside
-    its bounds. Null figures (nothing decided) are not wrong.
+    A metric is wrong if it is a share or bound outside [0, 1], or a PECS that is not Acc x max(0, J) or lies outside
+    its bounds. Null metrics (nothing decided) are not wrong.
     """
     acc, abs_rec, false_abs, pecs = (cells[name].to_numpy(float) for name in ("acc", "abs_rec", "false_abs", "pecs"))
     low, high = (cells[name].to_numpy(float) for name in BOUNDS)

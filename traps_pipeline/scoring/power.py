@@ -1,7 +1,7 @@
 """Predict the width of a study's PECS interval, and its detectable difference.
 
 Simulated studies of a model have independent answers, and each is resampled as in `bootstrap`, with its unseen
-scenarios. That holds at J = 0 as well, where PECS is clipped, and with few pairs. The overall figure is the mean over
+scenarios. That holds at J = 0 as well, where PECS is clipped, and with few pairs. The overall metric is the mean over
 datasets. Runs ask the same scenarios again and are not counted. Two datasets of one taxonomy share their clips: if
 answers to them are correlated, intervals are wider than predicted.
 """

@@ -18,7 +18,7 @@ Deviation = Annotated[float | None, "population standard deviation over runs"]
 Bootstrap = Annotated[
     float | None, "95 % interval, Bayesian bootstrap over scenarios with one unseen; null without a value"
 ]
-# Marks of a figure, which declare the columns beside it.
+# Marks of a metric, which declare the columns beside it.
 STD, CI, WILSON = (
     ExtraColumns(("_std",), Deviation),
     ExtraColumns(("_ci_low", "_ci_high"), Bootstrap),
@@ -45,7 +45,7 @@ class MetricsRow(shared.CellRow):
     counts: Annotated[int, "", EACH_COUNT]
     decisions: Annotated[int | None, "", EACH_COUNT_OF_DECISIONS]
     n_answered: Annotated[int, "items with an answer"]
-    figures: Annotated[float | None, "", EACH_METRIC]
+    metrics: Annotated[float | None, "", EACH_METRIC]
     pecs_low: Annotated[float, "pecs of all pairs if every missing decision were the worst for the model"]
     pecs_high: Annotated[float, "pecs of all pairs if every missing decision were the best for the model"]
     naive: Annotated[float | None, "acc x abs_rec"]
@@ -72,7 +72,7 @@ class ContrastRow:
 
     kind: Annotated[str, "models (of one regime) or regimes (of one model)"]
     dataset: DatasetOrOverall
-    figure: Annotated[str, "pecs or j"]
+    metric: Annotated[str, "pecs or j"]
     left_model: shared.Model
     left_regime: shared.Regime
     right_model: shared.Model
@@ -98,7 +98,7 @@ CONTRASTS = Table(
     "contrasts",
     ContrastRow,
     partition_by=(),
-    key=("kind", "dataset", "figure", "left_model", "left_regime", "right_model", "right_regime"),
+    key=("kind", "dataset", "metric", "left_model", "left_regime", "right_model", "right_regime"),
 )
 
 
@@ -136,6 +136,7 @@ class LeaderboardRow(shared.EntryRow):
     dataset: DatasetOrOverall
     n_runs: Annotated[int, "runs averaged"]
     n_pairs: Annotated[int, "pairs per run"]
+    n_items: Annotated[int, "items per run: two a pair, but one of a held-out set"]
     n_missing: Annotated[int, "items without an answer or a majority, over runs"]
     counts: Annotated[int, "over runs", EACH_COUNT]
     decisions: Annotated[int | None, "over runs", EACH_COUNT_OF_DECISIONS]
@@ -143,7 +144,7 @@ class LeaderboardRow(shared.EntryRow):
     incomplete: Annotated[bool, "whether answered is below 0.99; for overall, in any of its datasets"]
     broken: Annotated[float, "share of items whose text is empty, truncated, unfinished, degenerate or unread"]
     is_broken: Annotated[bool, "whether broken is above 0.01; for overall, in any of its datasets"]
-    figures: Annotated[Mean, EACH_METRIC, STD, CI]
+    metrics: Annotated[Mean, EACH_METRIC, STD, CI]
     rank: Annotated[
         int | None,
         "by PECS among models, or reference rows, of a regime, dataset and panel; ties share it; null if of two panels",
@@ -170,7 +171,7 @@ LEADERBOARD = Table("leaderboard", LeaderboardRow, partition_by=(), key=("model"
 class TwoWayRow(shared.EntryRow):
     """A model under a regime on two events: is it the asked or the other event whose hiding makes it abstain?
 
-    Figures are means over runs. Beside them stands what must be inferred (the arms late_occluder and predictable_cut).
+    Metrics are means over runs. Beside them stands what must be inferred (the arms late_occluder and predictable_cut).
     """
 
     n_runs: Annotated[int, "runs averaged"]
@@ -188,7 +189,7 @@ class TwoWayRow(shared.EntryRow):
     acc: Annotated[float | None, "share of the questions answered correctly that the clip answers"]
     inference_acc: Annotated[float | None, "share of the items of late_occluder and predictable_cut answered correctly"]
     inference_abstains: Annotated[float | None, "share of these items abstained on"]
-    refused: Annotated[str | None, "why no figure joins the items; then all figures are null"]
+    refused: Annotated[str | None, "why no metric joins the items; then all metrics are null"]
 
 
 TWO_WAY = Table("two_way", TwoWayRow, partition_by=(), key=("model", "regime"))
@@ -211,7 +212,7 @@ class HypothesisRow(shared.EntryRow):
     abs_rec: Annotated[float | None, "share of voids abstained on", CI]
     j: Annotated[float | None, "abs_rec - false_abs", CI]
     compared: Annotated[str, "the metric that doses are compared by: j, or abstains, of all items of the dose"]
-    value: Annotated[float | None, "that figure"]
+    value: Annotated[float | None, "that metric"]
     n_compared: Annotated[int | None, "scenarios that the dose and its reference both have; null where refused"]
     at_reference: Annotated[float | None, "that metric at the reference, on the scenarios that both have"]
     change: Annotated[float | None, "by how much the dose is above it; null where refused", CI]
@@ -233,7 +234,7 @@ class GradedRow(shared.EntryRow):
 
     See docs/scoring.md, "Graded cuts".
 
-    All figures are expectations under the posterior, the distribution over answers that the futures of a cut have.
+    All metrics are expectations under the posterior, the distribution over answers that the futures of a cut have.
     """
 
     scope: Annotated[str, "all, or the range of the commonest answer's probability, such as 0.6 to 0.75"]

@@ -25,7 +25,7 @@ def score(verdicts: pd.DataFrame) -> Scores:
     """Return scores from the VERDICTS rows of pairs and, where they were asked, of two events."""
     cells = pd.concat([cell_metrics(rows) for _, rows in verdicts.groupby("dataset", sort=True)], ignore_index=True)
     pairs, cells_of_pairs = (rows.loc[rows["dataset"].isin(DATASETS)] for rows in (verdicts, cells))
-    resampled_figures = resample(pairs)
-    paired_contrasts = contrasts(resampled_figures, cells_of_pairs, pairs)
-    board = leaderboard(cells_of_pairs, intervals(resampled_figures), paired_contrasts)
+    resampled_metrics = resample(pairs)
+    paired_contrasts = contrasts(resampled_metrics, cells_of_pairs, pairs)
+    board = leaderboard(cells_of_pairs, intervals(resampled_metrics), paired_contrasts)
     return Scores(cells, board, two_way(verdicts))

@@ -41,8 +41,8 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     metrics: METRICS rows of the scopes `all` and, for `pecs_by_family`, `sub_scenario:`; others are ignored. Mean and
     population standard deviation (ddof 0) over runs. `overall` takes the equal-weight mean over the four datasets
     within each run first; a run that lacks a dataset is left out of it, and a model and regime without a complete run
-    has no overall row. A figure that is null in one run is null here, so that every mean is over `n_runs` runs. Items
-    without a text count in no figure; if there are too many of them, the entry is `incomplete`.
+    has no overall row. A metric that is null in one run is null here, so that every mean is over `n_runs` runs. Items
+    without a text count in no metric; if there are too many of them, the entry is `incomplete`.
     """
     groups = _runs(metrics).groupby(ENTRY, sort=True)
     means = group_metric(groups, [*CELL_METRICS, "pecs_by_family", *BOUNDS])
@@ -51,7 +51,6 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     sums[REJECTION_COLUMNS] = groups[REJECTION_COLUMNS].sum(min_count=1)
     board = means.join([deviations.add_suffix("_std"), sums])
     board["n_runs"] = groups["run"].nunique()
-    board["n_pairs"] = groups["n_pairs"].max()
     board["epoch"] = joined_in_groups(groups, "epoch", joined_epochs)
     board["panel"] = joined_in_groups(groups, "panel", joined_epochs)
     board["benchmark_version"] = joined_in_groups(groups, "benchmark_version", joined_versions)
@@ -59,6 +58,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
     board["incomplete"] = _spread_flags(cast(pd.Series, board["answered"] < INCOMPLETE_BELOW))
     board["broken"] = board[[*BROKEN_COUNTS]].sum(axis=1) / board["n_items"]
     board["is_broken"] = _spread_flags(cast(pd.Series, board["broken"] > BROKEN_ABOVE))
+    board[["n_pairs", "n_items"]] = groups[["n_pairs", "n_items"]].max()  # of a run, where counts are over runs
     return board.reset_index()
 
 
@@ -104,8 +104,8 @@ def _spread_flags(wrong: pd.Series) -> pd.Series:
     return wrong | (anywhere & (wrong.index.get_level_values("dataset") == "overall"))
 
 
-def group_metric(groups: Any, columns: Sequence[str], figure: Callable[..., np.ndarray] = np.mean) -> pd.DataFrame:
-    """Return a figure of each group's values in some columns, indexed by group.
+def group_metric(groups: Any, columns: Sequence[str], metric: Callable[..., np.ndarray] = np.mean) -> pd.DataFrame:
+    """Return a metric of each group's values in some columns, indexed by group.
 
     It is null if any value is null, so that no mean silently uses fewer values. Groups of one size are one array.
     """
@@ -114,7 +114,7 @@ def group_metric(groups: Any, columns: Sequence[str], figure: Callable[..., np.n
     sizes, table = np.array([len(rows) for rows in places]), np.full((len(index), len(columns)), np.nan)
     for size in np.unique(sizes):
         rows = np.stack([rows for rows in places if len(rows) == size])
-        table[sizes == size] = figure(np.ascontiguousarray(values[rows].swapaxes(1, 2)), axis=-1)
+        table[sizes == size] = metric(np.ascontiguousarray(values[rows].swapaxes(1, 2)), axis=-1)
     return pd.DataFrame(table, index, pd.Index(columns))
 
 
@@ -125,7 +125,7 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
     """
     is_separable = contrasts["separable"].astype("boolean").fillna(False)
     left, right = (contrasts[name].isin(reference_rows()) for name in ("left_model", "right_model"))
-    is_ranking = (contrasts["kind"] == "models") & (contrasts["figure"] == "pecs") & (left == right)
+    is_ranking = (contrasts["kind"] == "models") & (contrasts["metric"] == "pecs") & (left == right)
     separable = contrasts.loc[is_ranking & is_separable]
     wins, losses = Counter[tuple[str, ...]](), Counter[tuple[str, ...]]()
     for row in separable.to_dict("records"):
@@ -146,8 +146,8 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 def wrong_intervals(board: pd.DataFrame) -> int:
     """Return how many intervals are out of order or outside their score's limits."""
     n_wrong = 0
-    for figure in METRIC_WORDS:
-        low, high = (board[f"{figure}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
-        lowest, highest = limits_of(figure)
+    for metric in METRIC_WORDS:
+        low, high = (board[f"{metric}_ci_{end}"].to_numpy(float) for end in ("low", "high"))
+        lowest, highest = limits_of(metric)
         n_wrong += int(((low < lowest) | (low > high) | (high > highest)).sum())
     return n_wrong

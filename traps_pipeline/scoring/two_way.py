@@ -33,7 +33,7 @@ SHARES = (*CELLS, "acc", "inference_acc", "inference_abstains")
 def two_way(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> pd.DataFrame:
     """Return TWO_WAY rows from VERDICTS rows of two events and of INFERENCE_ARMS.
 
-    There is one row per model and regime. Figures are computed per run, then averaged; a figure that is null in one run
+    There is one row per model and regime. Metrics are computed per run, then averaged; a metric that is null in one run
     is null. A held-out study, which asks one item of a scenario, has effects and no conjunction.
     """
     items = verdicts.loc[verdicts["dataset"].isin([TWO_EVENTS, *INFERENCE_ARMS])]
@@ -71,7 +71,7 @@ def decisions(items: pd.DataFrame) -> pd.DataFrame:
 
 
 def _ends(items: pd.DataFrame, resampling: Resampling, named: str) -> dict[str, np.ndarray]:
-    """Return a run's ends, (2, 1 + resamples), of CELLS and LOWEST's figures."""
+    """Return a run's ends, (2, 1 + resamples), of CELLS and LOWEST's metrics."""
     shares = np.moveaxis(ends_of_shares(decisions(items), resampling, named), 1, 0)
     neither, other, asked, *_ = shares
     effects = {name: difference(*pair) for name, pair in (
@@ -96,18 +96,18 @@ def _entry(items: pd.DataFrame, resampling: Resampling, named: str) -> dict[str,
         "benchmark_version": joined_versions(main["benchmark_version"]),
         "refused": _refusal(main),
     }
-    figures: dict[str, Any] = dict.fromkeys((*SHARES, *(f"{name}{end}" for name in LOWEST for end in ENDS)))
+    metrics: dict[str, Any] = dict.fromkeys((*SHARES, *(f"{name}{end}" for name in LOWEST for end in ENDS)))
     if runs and not row["refused"]:
         of_runs = [_ends(rows, resampling, named) for rows in runs]
         means = {name: np.mean([ends[name] for ends in of_runs], axis=0) for name in of_runs[0]}
-        figures |= {name: float(means[name][1, 0]) for name in CELLS}
+        metrics |= {name: float(means[name][1, 0]) for name in CELLS}
         for name, lowest in LOWEST.items():
-            figures |= with_interval(name, means[name], (lowest, 1.0))
-        figures["acc"] = _mean_over_runs(events.loc[events["side"] == "control"], "correct")
+            metrics |= with_interval(name, means[name], (lowest, 1.0))
+        metrics["acc"] = _mean_over_runs(events.loc[events["side"] == "control"], "correct")
     if len(inferred) and not _refusal(items):
-        figures["inference_acc"] = _mean_over_runs(inferred, "correct")
-        figures["inference_abstains"] = _mean_over_runs(inferred, "abstained")
-    return row | figures
+        metrics["inference_acc"] = _mean_over_runs(inferred, "correct")
+        metrics["inference_abstains"] = _mean_over_runs(inferred, "abstained")
+    return row | metrics
 
 
 def _mean_over_runs(items: pd.DataFrame, decision: str) -> float:
@@ -115,16 +115,16 @@ def _mean_over_runs(items: pd.DataFrame, decision: str) -> float:
 
 
 def _refusal(items: pd.DataFrame) -> str | None:
-    """Return why no figure may join these items (their epochs or panels differ), or None."""
+    """Return why no metric may join these items (their epochs or panels differ), or None."""
     for kind in ("panel", "epoch"):
         names = joined_epochs(items[kind])
         if "+" in names:
-            return f"of {kind}s {names.replace('+', ' and ')}; figures of different {kind}s are never put in one figure"
+            return f"of {kind}s {names.replace('+', ' and ')}; metrics of different {kind}s are never joined"
     return None
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many TWO_WAY rows have a figure outside its limits or its interval."""
+    """Return how many TWO_WAY rows have a metric outside its limits or its interval."""
     shares = table[[*SHARES]].to_numpy(float)
     is_wrong = ((shares < 0) | (shares > 1)).any(axis=1)
     for name, lowest in LOWEST.items():

@@ -9,13 +9,12 @@ from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.storage.benchmark_tables import current_rows
 from traps_pipeline.storage.workspace import Workspace
 
-QueueName = Literal["unreviewed", "judges", "models", "alike", "all"]
+QueueName = Literal["unreviewed", "judges", "models", "all"]
 QUEUES: tuple[QueueName, ...] = get_args(QueueName)
 MEANINGS: Mapping[QueueName, str] = {
     "unreviewed": "not reviewed yet",
     "judges": "judges disagree",
     "models": "models disagree on the control",
-    "alike": "control clips look alike",
     "all": "all scenarios",
 }
 
@@ -34,23 +33,12 @@ def flags(workspace: Workspace) -> pd.DataFrame:
     return pd.DataFrame({"judges": split, "models": share * (1 - share)}).fillna(0.0)
 
 
-def queue(
-    name: QueueName,
-    scenarios: Sequence[str],
-    reviewed: frozenset[str],
-    flagged: pd.DataFrame,
-    alike: Mapping[str, float],
-) -> list[str]:
-    """Return the scenarios that a review queue offers, in order; reviewed ones stay only in `all`.
-
-    flagged: `flags`; alike: by scenario, the distance of its most similar one.
-    """
+def queue(name: QueueName, scenarios: Sequence[str], reviewed: frozenset[str], flagged: pd.DataFrame) -> list[str]:
+    """Return the scenarios that a review queue offers, in order. flagged: `flags`."""
     if name == "all":
         return list(scenarios)
     waiting = [each for each in scenarios if each not in reviewed]
     if name == "unreviewed":
         return waiting
-    if name == "alike":
-        return sorted((each for each in waiting if each in alike), key=lambda each: (alike[each], each))
     scores = flagged[name].to_dict() if len(flagged) else {}
     return sorted((each for each in waiting if scores.get(each, 0) > 0), key=lambda each: (-scores[each], each))

@@ -23,7 +23,6 @@ from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
 from traps_pipeline.report.explorer.scenario_words import answer_of_control, certificate_phrases, intervention
 from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect
-from traps_pipeline.servers.duplicates import Comparison
 from traps_pipeline.servers.queue import MEANINGS, QUEUES, QueueName, flags, queue
 from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page_html, script, study_file
 from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
@@ -92,15 +91,6 @@ class Review:
         return flags(self.workspace)
 
     @cached_property
-    def comparison(self) -> Comparison:
-        """The comparison of control clips, started by the queue of near duplicates."""
-        differences = {
-            id_: self.workspace.resolve(row["path"]) for (id_, side), row in self.clips.items() if side == "control"
-        }
-        clips = {id_: path for id_, path in sorted(differences.items()) if path.is_file()}
-        return Comparison(clips, {id_: str(spec["family"]) for id_, spec in self.specs.items()})
-
-    @cached_property
     def observed(self) -> dict[str, str]:
         """The observer's answers under its first regime, by item."""
         rows = self.workspace.tables.read_all(RESPONSES, ["item_id", "model", "regime", "run", "text"])
@@ -120,9 +110,8 @@ class Review:
         return frozenset(id_ for id_, correction in last.items() if is_reviewed([correction]))
 
     def queue(self, name: QueueName) -> list[str]:
-        """Return the scenarios that a queue of the review pages offers, in order."""
-        distances = {id_: neighbour.distance for id_, neighbour in self.comparison.found.items()}
-        return queue(name, list(self.specs), self.reviewed(), self.flags, distances)
+        """Return the scenarios of a queue (`queue.queue`)."""
+        return queue(name, list(self.specs), self.reviewed(), self.flags)
 
     def decide(self, sent: Decision) -> None:
         """Append a decision. Raises NotFound, Refused and Conflict."""
@@ -188,7 +177,6 @@ class Review:
         spec, scenarios = self.spec(scenario_id), self.queue(name)
         decisions = decisions_on(scenario_id)
         place = scenarios.index(scenario_id) if scenario_id in scenarios else -1
-        neighbour = self.comparison.found.get(scenario_id)
         void = "another" if json.loads(spec["evidence"]).get("twin_px") else "same"
         items = {side: f"{spec['taxonomy']}:{scenario_id}:{side}" for side in ("control", "void")}
         fields = {
@@ -197,7 +185,6 @@ class Review:
             "queue": name,
             "fps": self.clips.get((scenario_id, "control"), {}).get("fps"),
             "clips": [side for side in ("control", "void", "twin") if (scenario_id, side) in self.clips],
-            "alike": neighbour.scenario_id if neighbour else "",
             "before": scenarios[place - 1] if place > 0 else "",
             "after": next((scenario for scenario in scenarios[place + 1 :] if scenario != scenario_id), ""),
             "params": json.loads(spec["params"]),
@@ -217,7 +204,6 @@ class Review:
             labels=", ".join(spec["labels"]),
             certificate=[words for _, words in certificate_phrases(json.loads(spec["evidence"]))],
             observed={side: self.observed.get(item, "not asked") for side, item in items.items()},
-            alike=(neighbour, self.specs[neighbour.scenario_id]["question"]) if neighbour else None,
             decisions=decisions,
             is_reviewed=is_reviewed(decisions),
             queues={queue_name: (MEANINGS[queue_name], len(self.queue(queue_name))) for queue_name in QUEUES},
@@ -233,7 +219,6 @@ class Review:
             "review_done.html.j2",
             effect=self.summary(),
             queue=name,
-            comparing=self.comparison.progress if name == "alike" else "",
             queues={queue_name: (MEANINGS[queue_name], len(self.queue(queue_name))) for queue_name in QUEUES},
             reviewed=len(self.reviewed() & set(self.specs)),
             total=len(self.specs),
@@ -284,8 +269,6 @@ def review_app(review: Review) -> FastAPI:
 
     @app.get("/")
     def start(queue: QueueName = "unreviewed") -> Response:
-        if queue == "alike":
-            review.comparison.start()
         waiting = review.queue(queue)
         return RedirectResponse(f"/scenario/{waiting[0]}?queue={queue}" if waiting else f"/done?queue={queue}", 303)
 

@@ -50,6 +50,10 @@ class SeveralHosts(Protocol):
         """
         ...
 
+    def move(self, workspace: Any, address: Place) -> int:
+        """Move a study to s3://BUCKET/STUDY; return its ledger's row count. Raises TrapsError."""
+        ...
+
     def sensors(self) -> Sequence[dg.SensorDefinition]:
         """Return the daemon's sensors that start cluster runs and end unstartable ones."""
         ...

@@ -11,7 +11,7 @@
     VIDEOS = Table("videos", VideoRow, partition_by=(), key=("scenario_id", "side"))
 
 Each annotation gives a column's type and, in words, its meaning and unit; `| None` lets values be missing. The columns
-keep the order of the fields. Columns that stand beside a figure, such as the bounds of its interval, and columns of a
+keep the order of the fields. Columns that stand beside a metric, such as the bounds of its interval, and columns of a
 list, such as the metrics, are declared by a mark (`ExtraColumns`, `EachOf`) under the decorator `with_neighbours`. Each
 package declares its tables in a module `..._rows`; columns that several packages share are in `storage.columns`. The
 Arrow schema is made from the dataclass, and every file is checked against it on writing and on reading.

@@ -59,8 +59,8 @@ class SettledCell(Generic[AnyCell, AnyCall]):
     def output(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
         """Return the cell and its table, one row per call, with the tally of its calls."""
         dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
-        figures = {"wanted": len(self.rows), "dollars": round(dollars, 6)}
-        return self.cell, StageOutput([row_of(self.cell, *pair) for pair in self.answered()], self.tally, figures)
+        shown = {"wanted": len(self.rows), "dollars": round(dollars, 6)}
+        return self.cell, StageOutput([row_of(self.cell, *pair) for pair in self.answered()], self.tally, shown)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def _parents(*names: str) -> list[Parent]:
     return [dep(name, need="none") for name in dict.fromkeys(names) if is_declared(name)]
 
 
-@_stage("report_page", parents=_parents(*ANSWERS, "arms", *SCORES, *_REPORTED, "published"))
+@_stage("report_page", parents=_parents(*ANSWERS, *SCORES, *_REPORTED, "published"))
 def report_page(workspace: Workspace, _: None) -> StageOutput:
     """Return findings, leaderboard, figures and tables beside the paper's on one page.
 
@@ -41,7 +41,7 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
     """
     from traps_pipeline.report.cards import Card, Sources
     from traps_pipeline.report.printed_board import BOARD_FILE, board_bytes, board_tables
-    from traps_pipeline.report.publish import MARKDOWN, PAPER_CHAPTER, report_files, report_parts
+    from traps_pipeline.report.publish import MARKDOWN, report_files, report_parts
 
     sources = Sources(workspace)
     parts = report_parts(sources)
@@ -51,17 +51,16 @@ def report_page(workspace: Workspace, _: None) -> StageOutput:
             lambda p=p: p.make().data,
             (*p.reads, "published", *(("human_row",) if sources.study.certified else ())),
             p.inputs,
-            is_shared=p.chapter == PAPER_CHAPTER,
         )
         for p in parts
     ]
     contents, rebuilt_names = make_pieces(workspace, "report_page", code_of(GROUP), pieces)
     files = report_files(sources.study, [(name.partition("/")[0], Card.read(data)) for name, data in contents.items()])
-    figures = {
+    shown = {
         "made again": f"{len(rebuilt_names)} of {len(pieces)}: {', '.join(rebuilt_names[:NAMES]) or 'none'}",
         "leaderboard": Markdown(files[MARKDOWN].decode()),
     }
-    return StageOutput(files | {BOARD_FILE: board_bytes(board_tables(workspace))}, shown=figures)
+    return StageOutput(files | {BOARD_FILE: board_bytes(board_tables(workspace))}, shown=shown)
 
 
 @_stage("site", parents=_parents(*ANSWERS, "scene_specs", *SCORES, "contrasts", "regime_tests"))

@@ -32,7 +32,7 @@ from traps_pipeline.storage.workspace import Workspace
 if TYPE_CHECKING:
     import pandas as pd
 
-    from traps_pipeline.scoring.bootstrap import ResampledFigures
+    from traps_pipeline.scoring.bootstrap import ResampledMetrics
 
 _stage = partial(stage, group="scoring")
 
@@ -61,7 +61,7 @@ def _zero_check(find: str, noun: str) -> Callable[[Workspace, str | None, StageO
         Check(
             "shares_are_shares",
             "Acc, AbsRec and FalseAbs lie in [0, 1], PECS is Acc x max(0, J) and lies within its bounds.",
-            _zero_check("metrics.wrong_figures", "figures"),
+            _zero_check("metrics.wrong_metrics", "metrics"),
         )
     ],
 )
@@ -83,15 +83,15 @@ def _metrics_and_verdicts(workspace: Workspace, name: str) -> "tuple[pd.DataFram
     return cells, current_rows(workspace, VERDICTS)
 
 
-def _bootstrap_of(judged: "pd.DataFrame") -> "ResampledFigures":
+def _bootstrap_of(judged: "pd.DataFrame") -> "ResampledMetrics":
     """Return the bootstrap of verdicts, which one run needs twice: for the contrasts, then for the leaderboard."""
     from traps_pipeline.scoring.bootstrap import resample
 
-    rows, figures = SHARED_IN_RUN.pop("bootstrap", (None, None))  # after the second time the memory is free again
+    rows, resampled = SHARED_IN_RUN.pop("bootstrap", (None, None))  # after the second time the memory is free again
     if rows is None or not rows.equals(judged):
-        figures = resample(judged)
-        SHARED_IN_RUN["bootstrap"] = judged, figures
-    return figures
+        resampled = resample(judged)
+        SHARED_IN_RUN["bootstrap"] = judged, resampled
+    return resampled
 
 
 # The panel is an input of everything computed from its verdicts, so that a change of panel makes them stale at once,
@@ -108,8 +108,8 @@ def contrasts(workspace: Workspace, _: None) -> StageOutput:
     table = paired(_bootstrap_of(judged), cells, judged)
     separable, n_refused = table["separable"].to_numpy(bool, na_value=False), len(table.loc[table["refused"].notna()])
     separable_overall = table.loc[separable & (table["dataset"] == "overall")]
-    figures = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": n_refused}
-    return StageOutput(table, shown=figures)
+    shown = {"contrasts": rows_shown(separable_overall), "separable": int(separable.sum()), "refused": n_refused}
+    return StageOutput(table, shown=shown)
 
 
 @_stage(REGIME_TESTS, parents=_SCORED, wants=has_pairs)
@@ -151,7 +151,7 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     checks=[
         Check(
             "two_way_rows_hold",
-            "Shares lie in [0, 1], effects in [-1, 1], and each figure in its interval.",
+            "Shares lie in [0, 1], effects in [-1, 1], and each metric in its interval.",
             _zero_check("two_way.wrong_rows", "rows"),
         )
     ],
@@ -201,7 +201,7 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     checks=[
         Check(
             "graded_rows_hold",
-            "Figures lie in their limits and intervals; regret is the sum of its parts, and what the ideal earns more.",
+            "Metrics lie in their limits and intervals; regret is the sum of its parts, and what the ideal earns more.",
             _zero_check("graded.wrong_rows", "rows"),
         )
     ],

@@ -58,8 +58,8 @@ def _text(item: dict[str, Any]) -> Any:
 
 
 @metric
-def traps_figures() -> Any:
-    """Return the metric: PECS and its factors, overall and by dataset, and the figures of two events."""
+def traps_metrics() -> Any:
+    """Return PECS and its factors, overall and by dataset, and the metrics of two events."""
 
     def compute(scores: list[Any]) -> dict[str, float]:
         results = run_metrics(PanelDecision.of(score.score.metadata) for score in scores)
@@ -68,7 +68,7 @@ def traps_figures() -> Any:
     return compute
 
 
-@scorer(metrics=[traps_figures()])
+@scorer(metrics=[traps_metrics()])
 def panel(regime: str) -> Any:
     """Return the rule panel as scorer: 1 for a correct control or an abstained void."""
     item_of = {item["item_id"]: item for item in items()}

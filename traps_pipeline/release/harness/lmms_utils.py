@@ -47,12 +47,12 @@ def _messages(doc: dict[str, Any], lmms_eval_specific_kwargs: Any = None, *, reg
 
 
 def _results(doc: dict[str, Any], results: list[str], *, regime: str) -> dict[str, Any]:
-    """Return the panel's decision about an answer, under the name of each figure."""
+    """Return the panel's decision about an answer, under the name of each metric."""
     judged = {**vars(judge(doc, "answer", results[0], regime)), "regime": regime}
     return dict.fromkeys((f"traps_{name}" for name in NAMES), judged)
 
 
-def _figure(rows: list[dict[str, Any]], *, name: str) -> float | None:
+def _metric(rows: list[dict[str, Any]], *, name: str) -> float | None:
     return run_metrics(PanelDecision.of(row) for row in rows).get(name)
 
 
@@ -61,9 +61,9 @@ _BY_REGIME = {"text": _text, "messages": _messages, "results": _results}  # a ta
 
 
 def __getattr__(name: str) -> Callable[..., Any]:
-    """Return a function by its name in a task's YAML: a figure's, or a regime's (`guided_results`)."""
+    """Return a function by its name in a task's YAML: a metric's, or a regime's (`guided_results`)."""
     if name in NAMES:
-        return partial(_figure, name=name)
+        return partial(_metric, name=name)
     regime, _, kind = name.rpartition("_")
     if not regime or kind not in _BY_REGIME:
         raise AttributeError(name)

@@ -70,21 +70,21 @@ def judge(item: Mapping[str, Any], outcome: str, text: str | None, regime: str) 
 def run_metrics(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     """Return Acc, AbsRec, FalseAbs, J and PECS of one run.
 
-    Keys: `DATASET_FIGURE` for each dataset, and FIGURE overall, the equal-weight mean over the four datasets, None
+    Keys: `DATASET_METRIC` for each dataset, and METRIC overall, the equal-weight mean over the four datasets, None
     unless all four are present; TWO_WAY_METRICS if two events were asked; `missing`, the number of undecided items, and
     `unread`, those among them that the rules could not read.
     """
     rows = list(judged)
     results: dict[str, float | None] = {}
-    figures_of = {name: _dataset_figures([row for row in rows if row.dataset == name]) for name in DATASETS}
-    for name, dataset_figures in figures_of.items():
+    by_dataset = {name: _dataset_metrics([row for row in rows if row.dataset == name]) for name in DATASETS}
+    for name, dataset_metrics in by_dataset.items():
         if any(row.dataset == name for row in rows):
-            results |= {f"{name}_{figure}": dataset_figures[figure] for figure in RUN_METRICS}
-    for figure in RUN_METRICS:
-        values = [dataset_figures[figure] for dataset_figures in figures_of.values()]
+            results |= {f"{name}_{metric}": dataset_metrics[metric] for metric in RUN_METRICS}
+    for metric in RUN_METRICS:
+        values = [dataset_metrics[metric] for dataset_metrics in by_dataset.values()]
         values_present = [value for value in values if value is not None]
-        results[figure] = sum(values_present) / len(DATASETS) if len(values_present) == len(DATASETS) else None
-    results |= _two_way_figures([row for row in rows if row.dataset == TWO_EVENTS])
+        results[metric] = sum(values_present) / len(DATASETS) if len(values_present) == len(DATASETS) else None
+    results |= _two_way_metrics([row for row in rows if row.dataset == TWO_EVENTS])
     undecided_rows = [row for row in rows if row.abstained is None or (row.side == "control" and row.correct is None)]
     return results | {
         "missing": float(len(undecided_rows)),
@@ -92,7 +92,7 @@ def run_metrics(judged: Iterable[PanelDecision]) -> dict[str, float | None]:
     }
 
 
-def _two_way_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
+def _two_way_metrics(rows: list[PanelDecision]) -> dict[str, float | None]:
     """Return TWO_WAY_METRICS (`scoring.two_way`); none without rows."""
     if not rows:
         return {}
@@ -111,7 +111,7 @@ def _two_way_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
     return dict(zip(TWO_WAY_METRICS, (_share(conjunctions), *effects), strict=True))
 
 
-def _dataset_figures(rows: list[PanelDecision]) -> dict[str, float | None]:
+def _dataset_metrics(rows: list[PanelDecision]) -> dict[str, float | None]:
     acc = _share([row.correct for row in rows if row.side == "control"])
     false_abs = _share([row.abstained for row in rows if row.side == "control"])
     abs_rec = _share([row.abstained for row in rows if row.side == "void"])

@@ -1,7 +1,7 @@
 """Write the explorer: a folder to browse answers, from disk or any web host.
 
 `index.html` has one classic script; all data are script files, which a page opened from disk may load where it may not
-fetch; clips have relative paths. The content policy forbids any request outside the folder. Figures come from the
+fetch; clips have relative paths. The content policy forbids any request outside the folder. Numbers come from the
 study's tables; the page counts decisions and computes no metric.
 """
 
@@ -225,11 +225,11 @@ def _study(workspace: Workspace, answers: StudyAnswers, shards: list[Any], has_c
         "epochs": [*answers.epochs],
         "shards": shards,
         "n_votes": len(answers.votes),
-        "figures": [
+        "metrics": [
             {"field": m.name, "title": m.heading, "unit": m.unit, "in_paper": m.name in printed_by_paper}
             for m in METRIC_WORDS.values()
         ],
-        "two_way_figures": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in TWO_WAY_COLUMNS],
+        "two_way_metrics": [{"field": c.field, "title": c.heading, "unit": c.unit} for c in TWO_WAY_COLUMNS],
         "counts": [
             {"field": column.field, "title": column.heading, "unit": column.unit}
             for column, field in OPTIONAL.items()

@@ -1,1 +1,1 @@
-"""Draw the figures of docs/spec.md 10; equal frames give equal bytes."""
+"""Plot the figures of docs/spec.md 10; equal frames give equal bytes."""

@@ -1,4 +1,4 @@
-"""Draw figures of abstention: by kind of void, by prompt, and against doubt."""
+"""Plot figures of abstention: by kind of void, by prompt, and against doubt."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def visual_textual(results: Results) -> Figure:
     with figure_style():
         figure = new_figure(PAGE_IN, 2.9 + 0.13 * int(np.ceil(len(models) / 5)))
         scatter, bars = figure.subplots(1, 2, width_ratios=(1, 1))
-        _draw_rates(scatter, rates)
-        _draw_families(bars, rates)
-        _draw_models_key(figure, models)
+        _plot_rates(scatter, rates)
+        _plot_families(bars, rates)
+        _plot_models_key(figure, models)
     return figure
 
 
-def _draw_rates(axes: Axes, rates: pd.DataFrame) -> None:
+def _plot_rates(axes: Axes, rates: pd.DataFrame) -> None:
     look = looks(rates["model"])
     axes.plot([0, 100], [0, 100], color=SOFT, linewidth=0.7, linestyle=(0, (4, 2.5)), zorder=1)
     for row in rates.loc[_average(rates)].to_dict("records"):
@@ -61,8 +61,8 @@ def _average(rates: pd.DataFrame) -> pd.Series | pd.DataFrame:
     return rates["taxonomy"].eq("pooled") | ~rates["model"].isin(models)
 
 
-def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
-    """Draw both rates as means over a family's models."""
+def _plot_families(axes: Axes, rates: pd.DataFrame) -> None:
+    """Plot both rates as means over a family's models."""
     averaged_rates = rates.loc[_average(rates)]
     means = (
         averaged_rates.assign(family=averaged_rates["model"].map(model_family))
@@ -84,7 +84,7 @@ def _draw_families(axes: Axes, rates: pd.DataFrame) -> None:
     axes.set_title("filled: visual, hatched: textual", weight="normal", size=7)
 
 
-def _draw_models_key(figure: Figure, models: list[str]) -> None:
+def _plot_models_key(figure: Figure, models: list[str]) -> None:
     look = looks(models)
     handles = [legend_key(plain(model)[:26], *look[model], size=4.5) for model in models]
     style: dict[str, Any] = {"fontsize": 6, "handletextpad": 0.1, "columnspacing": 0.8}

@@ -1,4 +1,4 @@
-"""Draw activation patching."""
+"""Plot activation patching."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw what is claimed of a model, states among their rivals, and the margin by layer."""
+"""Plot what is claimed of a model, states among their rivals, and the margin by layer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw abstention and stated probability on graded cuts against true probability."""
+"""Plot abstention and stated probability on graded cuts against true probability."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw heatmaps over sub-scenarios, bars of confabulation axes."""
+"""Plot heatmaps over sub-scenarios, bars of confabulation axes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def sub_scenarios(results: Results) -> Figure:
         column_counts = [len(panel.columns) for panel in panels]
         axes = figure.subplots(1, len(panels), sharey=True, squeeze=False, width_ratios=column_counts)[0]
         n_before = int((~rows["order"]).sum())
-        scales = {panel.scale: _draw_grid(ax, panel, names, n_before) for ax, panel in zip(axes, panels, strict=True)}
+        scales = {panel.scale: _plot_grid(ax, panel, names, n_before) for ax, panel in zip(axes, panels, strict=True)}
         for scale, image in scales.items():
             figure.colorbar(image, ax=list(axes), label=f"{scale}, %", shrink=0.6, aspect=30, pad=0.01)
     return figure
@@ -87,8 +87,8 @@ def _means(rows: pd.DataFrame) -> list[Panel]:
     return [Panel(titles[s], [*names.values()], 100 * rows[[*names]].to_numpy(float), s) for s, names in of.items()]
 
 
-def _draw_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImage:
-    """Draw a panel: a white line ends occlusion's rows, a dash means not run."""
+def _plot_grid(ax: Axes, panel: Panel, names: list[str], first: int) -> AxesImage:
+    """Plot a panel: a white line ends occlusion's rows, a dash means not run."""
     columns, values = panel.columns, panel.values
     image = ax.imshow(values, cmap="Blues" if panel.scale == GOOD else "Oranges", vmin=0, vmax=100, aspect="auto")
     ax.set_facecolor("#f2f4f7")

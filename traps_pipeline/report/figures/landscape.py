@@ -1,4 +1,4 @@
-"""Draw models in the plane of J and Acc, with contours of PECS (docs/spec.md 10)."""
+"""Plot models in the plane of J and Acc, with contours of PECS (docs/spec.md 10)."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
         figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
         frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
-        labels = merge_labels(_draw_models(axes, points), axes)
+        labels = merge_labels(_plot_models(axes, points), axes)
         guided = points.loc[points["regime"].eq(GUIDED) & ~points["model"].isin(reference_rows())]
-        _draw_frontier(axes, guided)
-        _draw_rings(axes, guided)
-        _draw_key(figure)
+        _plot_frontier(axes, guided)
+        _plot_rings(axes, guided)
+        _plot_key(figure)
         freeze_layout(figure)
         place_labels(axes, labels, points.loc[:, ["j", "acc"]].to_numpy(float))
     return figure
@@ -76,7 +76,7 @@ def reasoning(results: Results) -> Figure:
     with figure_style():
         figure = new_figure(PAGE_IN, 3.5)
         panels = figure.subplots(1, 2, sharey=True)
-        labels = [_draw_chains(axes, chain_points.loc[chain_points["regime"] == regime], chains) for axes, regime in
+        labels = [_plot_chains(axes, chain_points.loc[chain_points["regime"] == regime], chains) for axes, regime in
                   zip(panels, PROMPTING, strict=True)]  # fmt: skip
         for axes, regime in zip(panels, PROMPTING, strict=True):
             frame_plane(axes, chain_points, "Acc, overall")
@@ -89,8 +89,8 @@ def reasoning(results: Results) -> Figure:
     return figure
 
 
-def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
-    """Draw all markers; return a label per model at its guided or else first point."""
+def _plot_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
+    """Plot all markers; return a label per model at its guided or else first point."""
     labels, look = [], looks(points["model"])
     for model, rows in points.groupby("model", sort=True):
         colour, marker = look[str(model)]
@@ -110,15 +110,15 @@ def _draw_models(axes: Axes, points: pd.DataFrame) -> list[Label]:
             if regime in at:
                 axes.scatter(*at[regime], zorder=zorder, clip_on=False, **styles[BY_NAME[regime].marker])
         shown_regime = next(regime for regime in (GUIDED, *at) if regime in at)
-        _draw_intervals(axes, rows.loc[rows["regime"] == shown_regime].to_dict("records")[0], colour)
+        _plot_intervals(axes, rows.loc[rows["regime"] == shown_regime].to_dict("records")[0], colour)
         x, y = at[shown_regime]
         mark = f" {INCOMPLETE_MARK}" if bool(rows["incomplete"].fillna(False).astype(bool).any()) else ""
         labels.append(Label(x, y, short(str(model)) + mark, colour))
     return labels
 
 
-def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
-    """Draw the 95 % intervals of J and Acc, clipped to possible values, if known."""
+def _plot_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
+    """Plot the 95 % intervals of J and Acc, clipped to possible values, if known."""
     style: dict[str, Any] = {"color": colour, "linewidth": 0.6, "alpha": 0.55, "zorder": 1.8, "clip_on": False}
     for name, lower_limit in (("j", -1.0), ("acc", 0.0)):
         low, high = row.get(f"{name}_ci_low", np.nan), row.get(f"{name}_ci_high", np.nan)
@@ -128,8 +128,8 @@ def _draw_intervals(axes: Axes, row: Mapping[Any, Any], colour: str) -> None:
         axes.plot(*((ends, (other_value, other_value)) if name == "j" else ((other_value, other_value), ends)), **style)
 
 
-def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
-    """Draw dashed steps around the points that a model equals or exceeds in Acc and J."""
+def _plot_frontier(axes: Axes, guided: pd.DataFrame) -> None:
+    """Plot dashed steps around the points that a model equals or exceeds in Acc and J."""
     at = guided.sort_values(["acc", "j"], ascending=False)[["acc", "j"]].to_numpy(float)
     steps, best = [], 0.0
     for acc, j in at:
@@ -146,7 +146,7 @@ def _draw_frontier(axes: Axes, guided: pd.DataFrame) -> None:
         )
 
 
-def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
+def _plot_rings(axes: Axes, guided: pd.DataFrame) -> None:
     families = guided["model"].map(model_family)
     for _, rows in guided.assign(family=families).dropna(subset=["pecs"]).groupby("family"):
         best = rows.loc[rows["pecs"].idxmax()]
@@ -156,7 +156,7 @@ def _draw_rings(axes: Axes, guided: pd.DataFrame) -> None:
             )
 
 
-def _draw_key(figure: Figure) -> None:
+def _plot_key(figure: Figure) -> None:
     handles = [
         legend_key("standard", "#475467", "o", size=4.5, markerfacecolor="white"),
         legend_key("guided", "#475467", "o", size=4.5),
@@ -168,7 +168,7 @@ def _draw_key(figure: Figure) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=3, **style)
 
 
-def _draw_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> list[Label]:
+def _plot_chains(axes: Axes, points: pd.DataFrame, chains: list[list[str]]) -> list[Label]:
     at = {row["model"]: (float(row["j"]), float(row["acc"])) for row in points.to_dict("records")}
     look, labels = looks(at), []
     for chain in chains:

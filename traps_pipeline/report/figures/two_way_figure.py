@@ -1,4 +1,4 @@
-"""Draw abstention on two events: by which of them is hidden."""
+"""Plot abstention on two events: by which of them is hidden."""
 
 from __future__ import annotations
 

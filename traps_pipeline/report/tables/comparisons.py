@@ -129,8 +129,8 @@ def uplift(results: Results) -> list[PrintedTable]:
 
 
 def _regime_trace(row: Mapping[str, Any], field: str) -> SourceItems:
-    regime, _, figure = field.partition("_")
-    return SourceItems("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(figure, ""))
+    regime, _, metric = field.partition("_")
+    return SourceItems("", row["model"], regime if regime in REGIMES else "", SIDE_OF.get(metric, ""))
 
 
 def naive(results: Results) -> list[PrintedTable]:
@@ -217,7 +217,7 @@ TOO_FEW = "too few"
 def contrasts(results: Results) -> list[PrintedTable]:
     """Return paired contrasts of overall PECS (Holm) between models and regimes."""
     rows = results.contrasts
-    rows = rows.loc[(rows["dataset"] == "overall") & (rows["figure"] == "pecs")]
+    rows = rows.loc[(rows["dataset"] == "overall") & (rows["metric"] == "pecs")]
     answer_words = rows["separable"].map({True: "yes", False: "no"}).astype(object)
     rows = rows.assign(separable=answer_words.where(rows["separable"].notna(), TOO_FEW))
     rows = rows.sort_values(["kind", "p_holm", "left_model"], ignore_index=True, kind="stable")

@@ -39,16 +39,16 @@ def graded(results: Results) -> list[PrintedTable]:
 def _notes(rows: pd.DataFrame) -> list[str]:
     largest_row = rows.loc[rows["n_items"].idxmax()]
     reference_columns = ("points_ideal", "points_best", "points_prior", "brier_ideal", "brier_even")
-    figures = {name: fraction(largest_row[name], 2) for name in reference_columns}
+    metrics = {name: fraction(largest_row[name], 2) for name in reference_columns}
     return [
         f"points a question: 1 for a right answer, -{WRONG_COSTS} for a wrong one, 0 for an abstention, as expected by "
         f"the cut's posterior; from a probability of {ANSWER_FROM:g} on an answer is worth its risk",
-        f"an ideal observer earns {figures['points_ideal']}; always abstaining earns 0; always the likeliest answer "
-        f"{figures['points_best']}; always the family's commonest answer {figures['points_prior']}",
+        f"an ideal observer earns {metrics['points_ideal']}; always abstaining earns 0; always the likeliest answer "
+        f"{metrics['points_best']}; always the family's commonest answer {metrics['points_prior']}",
         "regret: points that the ideal observer earns more: with the likeliest answer, without answers that are not "
         "worth their risk (rash), with those that are (shy)",
         f"Brier: of probabilities that are stated or those of the first token, from 0 to 2; the posterior has "
-        f"{figures['brier_ideal']}, equal probabilities {figures['brier_even']}; all other numbers are then of acting "
+        f"{metrics['brier_ideal']}, equal probabilities {metrics['brier_even']}; all other numbers are then of acting "
         f"on them: answering the largest from {ANSWER_FROM:g} on",
         "brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen; no part of any other number",
     ]

@@ -64,7 +64,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
     rows = results.corrected
     overall = rows.loc[rows["dataset"] == "overall"] if "overall" in set(rows["dataset"]) else rows
     entries = sort_rows(with_titles(overall), ["dataset", "model", "regime"])
-    figures = [
+    metrics = [
         Column(f"{name}{end}", f"{m.heading}{', corrected' if end else ''}", m.unit, group=not end, interval=True)
         for name, m in METRIC_WORDS.items()
         for end in ("", "_corrected")
@@ -80,7 +80,7 @@ def judge_corrected(results: Results) -> list[PrintedTable]:
         PrintedTable("panel_errors", "The panel against people", results.panel_errors, panel_notes, reasons, reason),
         PrintedTable(
             "judge_corrected", "Judged, and corrected for the panel’s errors", entries,
-            [MODEL, REGIME, DATASET, *figures, RUNS], notes if len(entries) else [], reason,
+            [MODEL, REGIME, DATASET, *metrics, RUNS], notes if len(entries) else [], reason,
         ),
     ]  # fmt: skip
 
@@ -98,9 +98,9 @@ def _score_of_people(rows: pd.DataFrame) -> str:
     row = row_of.get("overall", {})
     if not row or row["pecs"] != row["pecs"]:
         return f"{NOT_RUN} in full, since PECS needs labels of both sides of all four datasets"
-    figures = ", ".join(f"{each.heading.removesuffix(' %')} {each.text(row)}" for each in _METRICS)
+    metrics = ", ".join(f"{each.heading.removesuffix(' %')} {each.text(row)}" for each in _METRICS)
     readers, clips_seen = count_noun(row["n_people"], "person", "people"), count_noun(row["n_clips"], "clip")
-    return f"{figures} ({readers}, {clips_seen}, {row['seconds']:.0f} s a clip)"
+    return f"{metrics} ({readers}, {clips_seen}, {row['seconds']:.0f} s a clip)"
 
 
 def _validation_note(rows: pd.DataFrame) -> str:

@@ -38,7 +38,7 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
     doses = doses.assign(place=doses["dose"].map(place))
     rules = {f"{name}_shown": [_rule(row, name) for row in doses.to_dict("records")] for name in ("value", "change")}
     doses = doses.assign(**{f"rule_{name}": values for name, values in rules.items()})
-    kind = "J" if hypothesis.figure == "j" else "abstentions"
+    kind = "J" if hypothesis.metric == "j" else "abstentions"
     columns = [
         MODEL, REGIME, Column("dose", "Dose"), Column("counts_as", "Counts as"),
         Column("n_scenarios", "Scenarios", "count"),
@@ -66,7 +66,7 @@ def _hypothesis_table(rows: pd.DataFrame, hypothesis: Hypothesis) -> PrintedTabl
 
 
 def _rule(row: Mapping[Any, Any], name: str) -> str:
-    """Return a rule's figure with its name, or "not run"."""
+    """Return a rule's metric with its name, or "not run"."""
     rule, value = row["rule" if name == "value" else "rule_changing"], percent(row[f"rule_{name}"])
     if isinstance(rule, str):
         return f"{value} ({rule.removesuffix('-rule')})"

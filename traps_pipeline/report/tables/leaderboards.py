@@ -94,7 +94,7 @@ def per_dataset(results: Results) -> list[PrintedTable]:
 
 
 def replication_per_dataset(results: Results) -> list[PrintedTable]:
-    """Return the replication families' figures on each dataset."""
+    """Return the replication families' metrics on each dataset."""
     cells = with_marks(results.cells)
     rows = cells.loc[cells["model"].isin(analyses.models_of(group="replication"))]
     rows = sort_rows(with_titles(rows), ["model", "dataset", "regime"])

@@ -27,7 +27,7 @@ COLUMNS = (
 _NOTES = (
     "conjunction: share of scenarios with all eight items right; own and other effect: by how much abstention rises "
     "where the asked event alone, or the other one alone, is hidden; specificity: own minus other effect",
-    "what needs no understanding gets: 0 in every figure for always or never abstaining, whatever it answers; "
+    "what needs no understanding gets: 0 in every metric for always or never abstaining, whatever it answers; "
     "conjunction 0 and specificity 0 for a rule of the clip alone or of the question alone; an oracle has 100, 1, 0, 1",
     "inferred: late_occluder and predictable_cut, whose outcome is not shown; to abstain there is caution",
     "brackets: 95 % interval, Bayesian bootstrap over scenarios with one unseen; no part of PECS",
@@ -43,7 +43,7 @@ def two_way_table(rows: pd.DataFrame) -> PrintedTable:
     """Return the printed table of TWO_WAY rows, the most specific entry first."""
     columns = COLUMNS if rows["inference_acc"].notna().to_numpy().any() else COLUMNS[:-2]
     rows = rows.sort_values(["specificity", "model", "regime"], ascending=[False, True, True], ignore_index=True)
-    refusals = [f"{row['model']} {row['regime']}: no figure, {row['refused']}"
+    refusals = [f"{row['model']} {row['regime']}: no metric, {row['refused']}"
                 for row in rows.dropna(subset=["refused"]).to_dict("records")]  # fmt: skip
     notes = [*_NOTES, *refusals] if len(rows) else []
     return PrintedTable("two_way", "Two events, one of them hidden", rows, columns, notes, WHY_EMPTY, two_events_trace)

@@ -935,7 +935,7 @@ CERTIFICATES = (
 )
 
 
-def table() -> str:
+def certificate_table() -> str:
     """Return the certificates as a Markdown table; OpenGL affects bracketed numbers."""
     lines = ["| certificate | promises | does not promise | stored |", "| --- | --- | --- | --- |"]
     for certificate in CERTIFICATES:

@@ -8,7 +8,6 @@ import numpy as np
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
 
-HASH_BITS = 64
 NEAR_BITS = 8  # two pictures whose hashes differ in so few look alike
 NEAR_SHARE = 0.1  # of a family's records may have another one that looks like them
 

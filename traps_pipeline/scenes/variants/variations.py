@@ -258,7 +258,7 @@ VARIATIONS: Mapping[str, Arm] = {
 }
 
 
-def table() -> str:
+def variation_table() -> str:
     """Return the variations as the Markdown table of `docs/hypotheses.md`."""
     groups = itertools.groupby(VARIATIONS.values(), key=lambda arm: arm.promises)
     rows = [("; ".join(f"`{arm.name}`: {arm.takes_away}" for arm in arms), promises) for promises, arms in groups]

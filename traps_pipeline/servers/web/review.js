@@ -9,10 +9,6 @@ const clips = SHOWN.clips.map((side) => {
   const [title, note] = SHOWN.captions[side].split(/: (.*)/s);
   return { title, note, path, kind: side };
 });
-if (SHOWN.alike) {
-  const path = `/clip/${encodeURIComponent(SHOWN.alike)}/control`;
-  clips.splice(2, 0, { title: "Looks alike", note: `control of ${SHOWN.alike}`, path, kind: "twin" });
-}
 const shownPlayer = player(clips, SHOWN.fps, true);
 field("clips").append(shownPlayer.element);
 

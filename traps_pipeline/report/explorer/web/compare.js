@@ -173,14 +173,14 @@ function differenceTable(info, differences, { left, right, leftRegime, rightRegi
     return is(row, "right", left, leftRegime) && is(row, "left", right, rightRegime) ? [{ ...row, sign: -1 }] : [];
   });
   const place = (row) => Object.keys(info.titles).indexOf(row.dataset);
-  rows.sort((a, b) => place(a) - place(b) || b.figure.localeCompare(a.figure));
+  rows.sort((a, b) => place(a) - place(b) || b.metric.localeCompare(a.metric));
   const signed = (row, value) => (value === null ? null : row.sign * value);
   const cells = rows.map((row) => {
     const ends = [row.ci_low, row.ci_high].map((value) => signed(row, value));
     if (row.sign < 0) ends.reverse();
     return [
       info.titles[row.dataset] || row.dataset,
-      row.figure.toUpperCase(),
+      row.metric.toUpperCase(),
       row.refused ? `not compared: ${row.refused}` : fraction(signed(row, row.difference)),
       row.refused || ends[0] === null ? NONE : `[${fraction(ends[0])}, ${fraction(ends[1])}]`,
       pValue(row.p),

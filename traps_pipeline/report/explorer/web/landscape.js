@@ -99,7 +99,7 @@ function plane(info, rows, regime) {
   );
 }
 
-// The interval of a figure, cut to what the plane shows; none where there is none.
+// The interval of a metric, cut to what the plane shows; none where there is none.
 function ends(row, field) {
   const [low, high] = [row[`${field}_ci_low`], row[`${field}_ci_high`]];
   if (low === null || low === undefined) return [];
@@ -113,12 +113,12 @@ function planeTable(info, rows) {
   const columns = [
     { title: "Model" },
     { title: "Regime" },
-    ...info.figures.map(({ title }) => ({ title, number: true })),
+    ...info.metrics.map(({ title }) => ({ title, number: true })),
   ];
   const cells = sorted.map((row) => [
     row.of_paper ? `${row.model} (paper)` : link(["model", row.model], { regime: row.regime }, row.model),
     row.regime,
-    ...info.figures.map((each) => figure(row, each)),
+    ...info.metrics.map((each) => metric(row, each)),
   ]);
   return table(columns, withHeading(info, sorted, cells), { caption: "The points", name: "landscape", data: sorted });
 }

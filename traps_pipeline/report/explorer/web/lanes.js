@@ -180,7 +180,7 @@ function twoWaySection(info) {
           ? h("span", { class: "tag" }, row[field])
           : unit === "count"
             ? count(row[field])
-            : figure(row, { field, unit }),
+            : metric(row, { field, unit }),
     ),
   );
   const notes = info.two_way_notes.map((text) =>

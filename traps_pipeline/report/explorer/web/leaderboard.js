@@ -1,10 +1,10 @@
 // The leaderboard: the rows of the study's table, beside the paper's.
 
-// How a figure of the study's lists is printed.
+// How a metric of the study's lists is printed.
 const printerOf = ({ unit }) => (unit === "percent" ? percent : fraction);
 
-// A figure with its deviation over runs and its interval below it.
-function figure(row, { field, unit }, mark = "") {
+// A metric with its deviation over runs and its interval below it.
+function metric(row, { field, unit }, mark = "") {
   const print = printerOf({ unit });
   if (!row || row[field] === null || row[field] === undefined)
     return row ? [NONE, mark ? ` ${mark}` : null] : h("span", { class: "absent" }, NOT_RUN);
@@ -12,7 +12,7 @@ function figure(row, { field, unit }, mark = "") {
   const spread = row.n_runs > 1 && `${field}_std` in row ? `± ${print(row[`${field}_std`])}` : "";
   const interval = low === null || low === undefined ? "" : `[${print(low)}, ${print(row[`${field}_ci_high`])}]`;
   return [
-    h("span", { class: "figure", "data-field": field }, print(row[field])),
+    h("span", { class: "metric", "data-field": field }, print(row[field])),
     mark ? ` ${mark}` : null,
     spread || interval ? h("span", { class: "interval" }, [interval, spread].filter(Boolean).join(" ")) : null,
   ];
@@ -26,7 +26,7 @@ function rankOf(row) {
 async function leaderboardView(route) {
   const info = await study();
   const own = info.leaderboard;
-  const ofPaper = info.figures.filter((each) => each.in_paper);
+  const ofPaper = info.metrics.filter((each) => each.in_paper);
   const hasOverall = own.some((row) => row.dataset === "overall");
   const dataset = route.parameters.dataset || (hasOverall || !own.length ? "overall" : own[0].dataset);
   const { regime = "", group = "", sort = "pecs", up = "", paper = "" } = route.parameters;
@@ -56,10 +56,10 @@ async function leaderboardView(route) {
   const columns = [
     { title: "Model", sort: "model" },
     { title: "Regime", sort: "regime" },
-    ...info.figures.map(({ field, title }) => ({ title, number: true, sort: field, hint: info.legend[title] })),
+    ...info.metrics.map(({ field, title }) => ({ title, number: true, sort: field, hint: info.legend[title] })),
     { title: "Rank", number: true, hint: "by PECS among the models of a regime; ranks in between are not separable" },
     ...(beside.size
-      ? info.two_way_figures.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
+      ? info.two_way_metrics.map(({ title }, k) => ({ title, number: true, group: !k, hint: info.legend[title] }))
       : []),
     ...(withPaper
       ? ofPaper.map(({ field, title }, k) => ({
@@ -81,11 +81,11 @@ async function leaderboardView(route) {
       ? link(["model", row.model], { regime: row.regime, dataset: dataset === "overall" ? "" : dataset }, row.model)
       : row.model,
     h("span", { class: "tag" }, row.regime),
-    ...info.figures.map((each) =>
-      figure(row.own, each, each.field === "pecs" ? markOf(row.own) : ""),
+    ...info.metrics.map((each) =>
+      metric(row.own, each, each.field === "pecs" ? markOf(row.own) : ""),
     ),
     rankOf(row.own),
-    ...(beside.size ? info.two_way_figures.map((each) => figure(row.twoWay, each)) : []),
+    ...(beside.size ? info.two_way_metrics.map((each) => metric(row.twoWay, each)) : []),
     ...(withPaper
       ? ofPaper.map((each) =>
           row.paper ? h("span", { title: `epoch ${row.paper.epoch}` }, printerOf(each)(row.paper[each.field])) : NONE,
@@ -172,7 +172,7 @@ function rowOfPeople(info, dataset, columns) {
   const cells = [
     "People",
     h("span", { class: "tag" }, "no prompt"),
-    ...info.figures.map((each) => figure(row && row[each.field] !== null ? row : undefined, each)),
+    ...info.metrics.map((each) => metric(row && row[each.field] !== null ? row : undefined, each)),
     NONE,
   ];
   const rest = columns
@@ -190,7 +190,7 @@ function ordering(sort, up, regimes) {
   };
   return (left, right) => {
     const [a, b] = [valueOf(left), valueOf(right)];
-    if ((a === null) !== (b === null)) return a === null ? 1 : -1; // without a figure: last, in either direction
+    if ((a === null) !== (b === null)) return a === null ? 1 : -1; // without a metric: last, in either direction
     const by = a === b ? 0 : (a < b ? -1 : 1) * (up ? 1 : -1);
     const ofPaper = a === null ? (right.paper?.pecs ?? -1) - (left.paper?.pecs ?? -1) : 0;
     return (

@@ -1,4 +1,4 @@
-// One model: its figures, and what became of its pairs, by regime and by family. Every count leads to its answers.
+// One model: its metrics, and what became of its pairs, by regime and by family. Every count leads to its answers.
 
 async function modelView(route) {
   const [name] = route.path;
@@ -42,12 +42,12 @@ async function modelView(route) {
           "Family",
         ),
       ),
-      section("Metrics", modelFigures(info, name, dataset, regime)),
+      section("Metrics", modelMetrics(info, name, dataset, regime)),
     ],
   };
 }
 
-function modelFigures(info, name, dataset, regime) {
+function modelMetrics(info, name, dataset, regime) {
   const fits = (row) =>
     row.model === name && (!dataset || row.dataset === dataset) && (!regime || row.regime === regime);
   const own = info.leaderboard.filter(fits);
@@ -56,7 +56,7 @@ function modelFigures(info, name, dataset, regime) {
   const columns = [
     { title: "Regime" },
     { title: "Dataset" },
-    ...info.figures.map(({ title }) => ({ title, number: true })),
+    ...info.metrics.map(({ title }) => ({ title, number: true })),
     { title: "n", number: true },
     { title: "Runs", number: true },
     { title: "Missing", number: true },
@@ -64,7 +64,7 @@ function modelFigures(info, name, dataset, regime) {
   const rows = own.map((row) => [
     row.regime,
     info.titles[row.dataset] || row.dataset,
-    ...info.figures.map((each) => figure(row, each)),
+    ...info.metrics.map((each) => metric(row, each)),
     count(row.n_pairs),
     count(row.n_runs),
     count(row.n_missing),

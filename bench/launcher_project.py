@@ -1,5 +1,5 @@
-"""The Dagster project of `bench/cluster_gate.py`: cells that each take half a minute of small steps, every step a row
-in PostgreSQL that is written once, as the ledger's are."""
+"""The Dagster project of `bench/cluster_launcher.py`: cells that each take half a minute of small steps, every step a
+row in PostgreSQL that is written once, as the ledger's are."""
 
 import os
 import time
@@ -8,7 +8,7 @@ import dagster as dg
 import psycopg
 
 CELLS, STEPS, STEP_S = [f"c{n:02d}" for n in range(12)], 60, 0.5
-VARIABLE = "TRAPS_GATE_DATABASE"
+VARIABLE = "TRAPS_LAUNCHER_DATABASE"
 SCHEMA = """
 create table if not exists tried (cell text, step int, run text, node text, at timestamptz default clock_timestamp());
 create table if not exists made (cell text, step int, node text, primary key (cell, step));
@@ -28,4 +28,4 @@ def work(context: dg.AssetExecutionContext) -> None:
 
 
 # In process, as this project's runs are: a step in a process of its own outlives the kill of its run.
-defs = dg.Definitions(assets=[work], jobs=[dg.define_asset_job("gate", [work])], executor=dg.in_process_executor)
+defs = dg.Definitions(assets=[work], jobs=[dg.define_asset_job("launcher", [work])], executor=dg.in_process_executor)

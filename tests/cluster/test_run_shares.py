@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from traps_cluster.run_shares import WORTH_S, cut_keys, shared_out
 from traps_pipeline.pipeline.partitioning import Partitioning
-from traps_pipeline.pipeline.ranges import WORTH_S, cut_keys, shared_out
 from traps_pipeline.pipeline.schemes import CATEGORY, CELL, DATASET
 from traps_pipeline.pipeline.translation import partitions_of
 

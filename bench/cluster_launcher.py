@@ -1,7 +1,7 @@
 """What Dagster's run queue and dagster-ray's launcher do when things are killed: PostgreSQL for the history, a Ray head
 without CPUs, two nodes with a scratch folder each, all on this machine. Prints what became of each run and when.
 
-python bench/cluster_gate.py [run] [node] [head] [stopped] [postgres]       (needs the packages of the extra `cluster`)
+python bench/cluster_launcher.py [run] [node] [head] [stopped] [postgres]    (needs the packages of the extra `cluster`)
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HEALTH = {"RAY_health_check_timeout_ms": "5000", "RAY_health_check_failure_thres
 ENDED = ("SUCCESS", "FAILURE", "CANCELED")
 DAGSTER_YAML = """
 telemetry: {{enabled: false}}
-storage: {{postgres: {{postgres_url: {{env: TRAPS_GATE_HISTORY}}}}}}
+storage: {{postgres: {{postgres_url: {{env: TRAPS_LAUNCHER_HISTORY}}}}}}
 run_launcher:
   module: dagster_ray
   class: RayRunLauncher
@@ -144,17 +144,17 @@ def _of_run(run_id: str) -> list[int]:
 
 
 @contextmanager
-def gate() -> Iterator[Gate]:
+def launcher() -> Iterator[Launcher]:
     from tests.postgres import Postgres
 
-    with tempfile.TemporaryDirectory(prefix="gate-") as name, Postgres.running(durable=True) as database:
+    with tempfile.TemporaryDirectory(prefix="runs-") as name, Postgres.running(durable=True) as database:
         folder = Path(name)
         foreign = ("TRAPS_", "DAGSTER_", "RAY_")
         environment = {key: value for key, value in os.environ.items() if not key.startswith(foreign)}
         environment |= {
             # SQLAlchemy 2.1 takes psycopg 3 for a plain postgresql://, and dagster-postgres's NOTIFY fails with it.
-            "TRAPS_GATE_HISTORY": database.address().replace("postgresql:", "postgresql+psycopg2:"),
-            "TRAPS_GATE_DATABASE": database.address(),
+            "TRAPS_LAUNCHER_HISTORY": database.address().replace("postgresql:", "postgresql+psycopg2:"),
+            "TRAPS_LAUNCHER_DATABASE": database.address(),
             "DAGSTER_HOME": str(folder / "home"),
             "PYTHONPATH": str(ROOT),
             "TMPDIR": str(folder),
@@ -164,8 +164,8 @@ def gate() -> Iterator[Gate]:
         cluster = Cluster(folder, environment)
         (folder / "home").mkdir()
         (folder / "home" / "dagster.yaml").write_text(DAGSTER_YAML.format(dashboard=cluster.dashboard, poll=POLL_S))
-        (folder / "workspace.yaml").write_text("load_from: [{python_module: {module_name: bench.gate_project}}]\n")
-        running = Gate(folder, cluster, database)
+        (folder / "workspace.yaml").write_text("load_from: [{python_module: {module_name: bench.launcher_project}}]\n")
+        running = Launcher(folder, cluster, database)
         try:
             cluster.start_head()
             for node in ("one", "two"):
@@ -179,7 +179,7 @@ def gate() -> Iterator[Gate]:
                 cluster.signal(node, signal.SIGKILL)
 
 
-class Gate:
+class Launcher:
     """The cluster with Dagster's daemon, and what is known of runs."""
 
     def __init__(self, folder: Path, cluster: Cluster, database: Any) -> None:
@@ -191,7 +191,7 @@ class Gate:
         import psycopg
         from dagster import DagsterInstance
 
-        from bench.gate_project import SCHEMA
+        from bench.launcher_project import SCHEMA
 
         with psycopg.connect(self.database.address(), autocommit=True) as opened:
             opened.execute(SCHEMA)
@@ -204,13 +204,13 @@ class Gate:
         if self.daemon is not None:
             self.daemon.terminate()
             self.daemon.wait()
-        if keep := os.environ.get("TRAPS_GATE_LOG"):
+        if keep := os.environ.get("TRAPS_LAUNCHER_LOG"):
             shutil.copy(self.folder / "daemon.log", keep)
 
     def submit(self, cell: str) -> str:
         """Put a run of one cell in the queue; its id."""
         said = subprocess.run(
-            [sys.executable, "-m", "dagster", "job", "launch", "-w", self.folder / "workspace.yaml", "-j", "gate",
+            [sys.executable, "-m", "dagster", "job", "launch", "-w", self.folder / "workspace.yaml", "-j", "launcher",
              "--tags", f'{{"dagster/partition": "{cell}"}}'],
             capture_output=True, text=True, cwd=ROOT, check=False,
         )  # fmt: skip
@@ -277,74 +277,74 @@ class Gate:
             self.failures.append(f"{cell} is {status} with {made} of {STEPS} steps")
 
 
-def killed_run(gate: Gate) -> None:
+def killed_run(launcher: Launcher) -> None:
     """kill -9 of the process that executes a run."""
-    run_id = gate.submit("c00")
-    gate.node_of("c00")
+    run_id = launcher.submit("c00")
+    launcher.node_of("c00")
     time.sleep(3)
     began = time.monotonic()
     for pid in _of_run(run_id):
         os.kill(pid, signal.SIGKILL)
-    gate.watch({"c00": run_id}, began)
+    launcher.watch({"c00": run_id}, began)
 
 
-def killed_node(gate: Gate) -> None:
+def killed_node(launcher: Launcher) -> None:
     """kill -9 of every process of a node; the other one stays."""
-    run_id = gate.submit("c01")
-    node = gate.node_of("c01")
+    run_id = launcher.submit("c01")
+    node = launcher.node_of("c01")
     time.sleep(3)
     began = time.monotonic()
-    print(f"  {gate.cluster.signal(node, signal.SIGKILL)} processes of {node} killed")
-    gate.watch({"c01": run_id}, began)
-    gate.cluster.start_node(node)
+    print(f"  {launcher.cluster.signal(node, signal.SIGKILL)} processes of {node} killed")
+    launcher.watch({"c01": run_id}, began)
+    launcher.cluster.start_node(node)
 
 
-def killed_head(gate: Gate) -> None:
+def killed_head(launcher: Launcher) -> None:
     """kill -9 of every process of the head; it and the nodes are started again, as an init system would."""
-    run_id = gate.submit("c02")
-    gate.node_of("c02")
+    run_id = launcher.submit("c02")
+    launcher.node_of("c02")
     time.sleep(3)
     began = time.monotonic()
-    print(f"  {gate.cluster.signal('head', signal.SIGKILL)} processes of the head killed")
+    print(f"  {launcher.cluster.signal('head', signal.SIGKILL)} processes of the head killed")
     time.sleep(5)
     for node in ("one", "two"):
-        gate.cluster.signal(node, signal.SIGKILL)
-    gate.cluster.start_head()
+        launcher.cluster.signal(node, signal.SIGKILL)
+    launcher.cluster.start_head()
     for node in ("one", "two"):
-        gate.cluster.start_node(node)
-    gate.watch({"c02": run_id}, began)
+        launcher.cluster.start_node(node)
+    launcher.watch({"c02": run_id}, began)
 
 
-def stopped_node(gate: Gate) -> None:
+def stopped_node(launcher: Launcher) -> None:
     """SIGSTOP of every process of a node for 90 s, then SIGCONT."""
-    run_id = gate.submit("c03")
-    node = gate.node_of("c03")
+    run_id = launcher.submit("c03")
+    node = launcher.node_of("c03")
     time.sleep(3)
     began = time.monotonic()
-    print(f"  {gate.cluster.signal(node, signal.SIGSTOP)} processes of {node} stopped")
-    gate.watch({"c03": run_id}, began, 90, may_go_on=True)
-    gate.cluster.signal(node, signal.SIGCONT)
+    print(f"  {launcher.cluster.signal(node, signal.SIGSTOP)} processes of {node} stopped")
+    launcher.watch({"c03": run_id}, began, 90, may_go_on=True)
+    launcher.cluster.signal(node, signal.SIGCONT)
     print("  continued")
-    gate.watch({"c03": run_id}, began)
-    alive = gate.cluster.processes(node)
+    launcher.watch({"c03": run_id}, began)
+    alive = launcher.cluster.processes(node)
     print(f"  {len(alive)} processes of {node} are left")
     if not alive:
-        gate.cluster.start_node(node)
+        launcher.cluster.start_node(node)
 
 
-def killed_postgres(gate: Gate) -> None:
+def killed_postgres(launcher: Launcher) -> None:
     """Immediate stop of PostgreSQL, started again after 5 s."""
-    run_id = gate.submit("c04")
-    gate.node_of("c04")
+    run_id = launcher.submit("c04")
+    launcher.node_of("c04")
     time.sleep(3)
     began = time.monotonic()
-    gate.database.stop()
+    launcher.database.stop()
     time.sleep(5)
-    gate.database.start()
-    gate.watch({"c04": run_id}, began, may_fail=True)
+    launcher.database.start()
+    launcher.watch({"c04": run_id}, began, may_fail=True)
 
 
-SCENARIOS: dict[str, Callable[[Gate], None]] = {
+SCENARIOS: dict[str, Callable[[Launcher], None]] = {
     "run": killed_run, "node": killed_node, "head": killed_head, "stopped": stopped_node, "postgres": killed_postgres,
 }  # fmt: skip
 
@@ -353,7 +353,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenarios", nargs="*", choices=[*SCENARIOS, []], default=[])
     chosen = parser.parse_args().scenarios or [*SCENARIOS]
-    with gate() as running:
+    with launcher() as running:
         for name in chosen:
             print(f"{name}: {SCENARIOS[name].__doc__}", flush=True)
             SCENARIOS[name](running)
