@@ -1,11 +1,13 @@
-"""Give researchers a study's states (arrays), directions, and probe protocol.
+"""Give researchers a study's states (arrays), prompts, directions, and probe protocol.
 
     from traps_pipeline import inside
 
-    states = inside.load(".workspaces/mechanism", "pocket", layer=3)   # states.X, states.void, states.items
-    figures = inside.protocol(".workspaces/mechanism", "pocket", layer=3, fit=inside.mean_difference)
-    with inside.direction(".workspaces/mechanism", "pocket", "occlusion", layer=3).apply(network, gaps=-1):
+    states = inside.load(".workspaces/mechanism", "pocket")            # states.X, states.void, states.items
+    figures = inside.protocol(".workspaces/mechanism", "pocket", fit=inside.mean_difference)
+    with inside.direction(".workspaces/mechanism", "pocket", "occlusion").apply(network, gaps=-1):
         network.generate(...)                                          # a plain transformers model
+
+Where no layer is named, it is the one that the study chose without labels of the dataset (`layer`).
 
 docs/inside.ipynb walks through this; a test runs it.
 """
@@ -14,8 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -23,19 +25,21 @@ import pandas as pd
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.mechanism.hook import Site, register_change
-from traps_pipeline.mechanism.live_gate import Where, open_study
-from traps_pipeline.mechanism.live_gate import gate as gate
+from traps_pipeline.mechanism.notebook import AnyLayer, Where, check_layer, check_name, chosen_layer, study_states
+from traps_pipeline.mechanism.notebook import gate as gate
+from traps_pipeline.mechanism.notebook import layer as layer
+from traps_pipeline.mechanism.notebook import lens as lens
+from traps_pipeline.mechanism.notebook import load_model as load_model
+from traps_pipeline.mechanism.notebook import prompt as prompt
+from traps_pipeline.mechanism.notebook import sweep as sweep
 from traps_pipeline.mechanism.other_probes import erased as erased
 from traps_pipeline.mechanism.other_probes import from_sklearn as from_sklearn
 from traps_pipeline.mechanism.other_probes import mean_difference as mean_difference
 from traps_pipeline.mechanism.probes import Fit, fit_probe
 from traps_pipeline.mechanism.probing import ProbeRun
 from traps_pipeline.mechanism.stages import saved_directions
-from traps_pipeline.mechanism.stored_states import StoredStates
-from traps_pipeline.models.registry.entries import get_model
-from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction
+from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.protocol.regimes import REGIMES
-from traps_pipeline.storage.study import ProbeSettings
 from traps_pipeline.storage.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -45,7 +49,7 @@ if TYPE_CHECKING:
 # --- states -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LoadedStates:
     """States with their items and verdicts.
 
@@ -62,6 +66,10 @@ class LoadedStates:
     X: np.ndarray
     items: pd.DataFrame
 
+    def __repr__(self) -> str:
+        """Return the numbers of items and of values, and the datasets."""
+        return f"LoadedStates({' x '.join(map(str, self.X.shape))}, {', '.join(dict.fromkeys(self.items['dataset']))})"
+
     @property
     def void(self) -> np.ndarray:
         """Whether each item is a void, (n,) bool.
@@ -75,7 +83,7 @@ class LoadedStates:
         return self.items["void"].to_numpy(bool)
 
     def where(self, chosen: Any) -> LoadedStates:
-        """Return the items that a mask (n,) or a query on `items` selects.
+        """Return the items that a mask (n,) or a query on `items` selects. Raises TrapsError for another one.
 
         Examples
         --------
@@ -83,8 +91,12 @@ class LoadedStates:
         >>> states.where("dataset == 'occlusion' and void").void.all()
         np.True_
         """
-        mask = self.items.eval(chosen) if isinstance(chosen, str) else chosen
-        mask = np.asarray(mask, bool)
+        try:
+            mask = np.asarray(self.items.eval(chosen) if isinstance(chosen, str) else chosen, bool)
+        except (NameError, SyntaxError, TypeError, ValueError, LookupError, AttributeError) as error:
+            raise TrapsError(f"no query {chosen!r:.80} ({error}); columns: {', '.join(self.items)}") from error
+        if mask.shape != (len(self.items),):
+            raise TrapsError(f"a mask of {mask.shape} for {len(self.items)} items; give one value an item")
         return LoadedStates(self.X[mask], self.items.loc[mask].reset_index(drop=True))
 
 
@@ -92,14 +104,15 @@ def load(
     workspace: Where,
     model: str,
     *,
-    layer: int | Literal["normed"],
+    layer: AnyLayer | None = None,
     prompt: str = "standard",
     datasets: Sequence[str] | None = None,
 ) -> LoadedStates:
     """Return a study's states at one layer, joined with the verdicts of run 1.
 
-    layer: 0 for embeddings; `normed`: the last one after the final norm. datasets: some of those with states; all by
-    default. Raises TrapsError if the study has no such states, model, layer or dataset.
+    layer: 0 for embeddings; `normed`: the last one after the final norm; by default the study's chosen one of a single
+    dataset, else over all pairs. datasets: some of those with states; all by default. Raises TrapsError if the study
+    has no such states, model, layer or dataset.
 
     Examples
     --------
@@ -107,12 +120,13 @@ def load(
     >>> set(states.items["dataset"])
     {'chaotic'}
     """
-    opened = open_study(workspace)
-    states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
+    states = study_states(workspace, model, prompt)
     available = [*dict.fromkeys(states.items["dataset"])]
-    unknown = sorted(set(datasets or ()) - set(available))
-    if unknown:
-        raise TrapsError(f"no hidden states of {unknown[0]}; the study has {', '.join(available)}")
+    for dataset in datasets or ():
+        check_name("hidden states of dataset", dataset, available)
+    if layer is None:
+        layer = chosen_layer(states, *(datasets if datasets and len(datasets) == 1 else ()))
+    check_layer(states, layer)
     parts, vectors = list[pd.DataFrame](), list[np.ndarray]()
     for dataset in datasets or available:
         items = pd.DataFrame(
@@ -121,7 +135,7 @@ def load(
         items["void"] = items["side"] == "void"
         for regime in REGIMES:
             items = items.merge(
-                _verdicts(opened, Cell(dataset, Evaluation(model, regime, 1))), on="item_id", how="left"
+                _verdicts(states.workspace, Cell(dataset, Evaluation(model, regime, 1))), on="item_id", how="left"
             )
         parts.append(items)
         vectors.append(states.read(dataset, layer))
@@ -131,12 +145,8 @@ def load(
 
 def _verdicts(workspace: Workspace, cell: Cell) -> pd.DataFrame:
     names = ["abstained", "correct"]
-    regime = cell.evaluation.regime
-    if workspace.tables.state(VERDICTS, cell.partition) is None:
-        rows = pd.DataFrame({"item_id": pd.Series(dtype=object)} | {n: pd.Series(dtype="boolean") for n in names})
-    else:
-        rows = pd.DataFrame(workspace.tables.read(VERDICTS, cell.partition)[["item_id", *names]])
-    return rows.rename(columns={name: f"{name}_{regime}" for name in names})
+    rows = workspace.tables.read_all(VERDICTS, ["item_id", *names], **cell.partition)
+    return rows.rename(columns={name: f"{name}_{cell.evaluation.regime}" for name in names})
 
 
 # --- probes -----------------------------------------------------------------------------------------------------------
@@ -146,7 +156,7 @@ def protocol(
     workspace: Where,
     model: str,
     *,
-    layer: int,
+    layer: int | None = None,
     fit: Fit = fit_probe,
     prompt: str = "standard",
     change: Callable[[np.ndarray], np.ndarray] = lambda states: states,
@@ -155,10 +165,10 @@ def protocol(
     """Run the study's own protocol with another probe; return its rows.
 
     Rows are like those of `probe_baselines`, with the same items, folds, splits by scenario and intervals as the
-    study's. fit: maps states (n, d) and void (n,) to an object with `scores` (`from_sklearn`, `mean_difference`, your
-    own). change: transforms the states of a dataset, (n, d) to (n, k). features: used instead of the study's states;
-    datasets without features are left out. Columns: analysis, source, target, value (AUROC), low, high, n_voids,
-    n_controls.
+    study's. layer: by default each target's chosen one. fit: maps states (n, d) and void (n,) to an object with
+    `scores` (`from_sklearn`, `mean_difference`, your own). change: transforms the states of a dataset, (n, d) to
+    (n, k). features: used instead of the study's states; datasets without features are left out. Columns: analysis,
+    source, target, layer, value (AUROC), low, high, n_voids, n_controls.
 
     Examples
     --------
@@ -166,43 +176,34 @@ def protocol(
     >>> rows.query("target == 'occlusion'")["value"].between(0, 1).all()
     np.True_
     """
-    opened = open_study(workspace)
-    states = StoredStates.of(opened, Extraction(get_model(model).id, prompt))
-    mechanism = opened.study.mechanism
-    settings = mechanism.probes if mechanism else ProbeSettings()
-    items = states.items
+    states = study_states(workspace, model, prompt)
+    items, settings = states.items, states.workspace.mechanism
     if features is not None:
         items = items.loc[items["dataset"].isin([*dict.fromkeys(features.items["dataset"])])].reset_index(drop=True)
 
-    def read(dataset: str, _: int) -> np.ndarray:
+    def read(dataset: str, number: int) -> np.ndarray:
         if features is None:
-            return change(states.read(dataset, layer))
+            return change(states.read(dataset, number))
         places = pd.Index(features.items["item_id"]).get_indexer(pd.Index(states.dataset(dataset)["item_id"]))
         if (places < 0).any():
             raise TrapsError(f"`features` lacks {int((places < 0).sum())} items of {dataset}; give all items of it")
         return change(features.X[places])
 
-    seed = mechanism.seed if mechanism else 0
-    run = ProbeRun(items, read, 1, 0, settings, seed, fit=fit)
-    columns = ["analysis", "source", "target", "value", "low", "high", "n_voids", "n_controls"]
-    return pd.DataFrame(run.comparable_rows(0), columns=pd.Index(columns))
+    targets = [*dict.fromkeys(items["dataset"])]
+    if layer is None and features is None:
+        layers = {target: chosen_layer(states, target) for target in targets}
+    else:
+        check_layer(states, layer or 0)
+        layers = dict.fromkeys(targets, layer or 0)
+    run = ProbeRun(items, read, states.n_layers, 0, settings.probes, settings.seed, fit=fit)
+    rows = (row for number in sorted({*layers.values()}) for row in run.comparable_rows(number))
+    columns = ["analysis", "source", "target", "layer", "value", "low", "high", "n_voids", "n_controls"]
+    return pd.DataFrame((row for row in rows if layers[row["target"]] == row["layer"]), columns=pd.Index(columns))
 
 
 # --- interventions ----------------------------------------------------------------------------------------------------
 
 Change = Callable[["Tensor", "Tensor", float], "Tensor"]  # states (rows, T, d), unit direction (d,), amount -> states
-
-
-def add(states: Tensor, unit: Tensor, amount: float) -> Tensor:
-    """Add the amount along the direction at every position.
-
-    Examples
-    --------
-    >>> import torch
-    >>> inside.add(torch.zeros(1, 1, 2), torch.tensor([1.0, 0.0]), 3.0).tolist()
-    [[[3.0, 0.0]]]
-    """
-    return states + amount * unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +215,11 @@ class Direction:
 
     Examples
     --------
-    >>> inside.Direction(np.array([2.0, 0.0]), layer=3).layer
-    3
+    >>> inside.Direction(np.array([2.0, 0.0]), layer=3)
+    Direction(layer=3, gap=None)
     """
 
-    vector: np.ndarray
+    vector: np.ndarray = field(repr=False)
     layer: int
     gap: float | None = None
 
@@ -229,7 +230,7 @@ class Direction:
         amount: float | None = None,
         *,
         gaps: float | None = None,
-        change: Change = add,
+        change: Change = lambda states, unit, amount: states + amount * unit,
         site: Site = "residual",
     ) -> Iterator[None]:
         """Change a model's passes inside the context; always remove the hook after it.
@@ -267,16 +268,6 @@ class Direction:
         finally:
             handle.remove()
 
-    def __neg__(self) -> Direction:
-        """Return the reverse direction.
-
-        Examples
-        --------
-        >>> (-inside.Direction(np.array([2.0, 1.0]), layer=3)).vector
-        array([-2., -1.])
-        """
-        return replace(self, vector=-self.vector)
-
 
 def _block(model: Any, layer: int) -> tuple[Module, int]:
     """Return a block, and the width of the model's states."""
@@ -295,27 +286,30 @@ def direction(
     model: str,
     dataset: str,
     *,
-    layer: int,
+    layer: int | None = None,
     prompt: str = "standard",
     kind: str = "void",
     draw: int = 0,
 ) -> Direction:
     """Return a saved direction: a dataset's void direction, or a draw of a null.
 
-    It has the class gap. Raises TrapsError if the study has no such direction.
+    It has the class gap. layer: by default the dataset's chosen one. Raises TrapsError if the study has no such
+    direction.
 
     Examples
     --------
     >>> inside.direction(".workspaces/mechanism", "pocket", "occlusion", layer=2, kind="void").gap > 0
     True
     """
-    directions: Mapping[str, Any] = saved_directions(open_study(workspace), Extraction(get_model(model).id, prompt))
+    states = study_states(workspace, model, prompt)
+    directions: Mapping[str, Any] = saved_directions(states.workspace, states.extraction)
     if dataset not in directions or kind not in directions[dataset].vectors:
         available = ", ".join(
             f"{name} ({', '.join(directions_of.vectors)})" for name, directions_of in directions.items()
         )
         raise TrapsError(f"no {kind} direction of {dataset}; the study has {available or 'none'}")
     directions_of = directions[dataset]
+    layer = chosen_layer(states, dataset) if layer is None else layer
     if not 0 <= layer < directions_of.n_layers or not 0 <= draw < len(directions_of.vectors[kind]):
         raise TrapsError(f"no draw {draw} at layer {layer}: layers are 0 to {directions_of.n_layers - 1}")
     return Direction(directions_of.vectors[kind][draw][layer], layer, float(directions_of.gaps[layer]))

@@ -19,7 +19,7 @@ from traps_pipeline.base.paths import ASSETS, RELEASED
 from traps_pipeline.benchmark.certify_all import foreseeable
 from traps_pipeline.benchmark.composition import composition_problems, load_composition, prior_accuracy
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.benchmark.stored_evidence import answerable_ill_posed, answerable_voids, unanswerable_controls
+from traps_pipeline.benchmark.stored_evidence import failed_certificates
 from traps_pipeline.scenes.certification.certify_record import Verdict, state_at_cut
 from traps_pipeline.scenes.family_registry import family_names, get_family
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
@@ -110,9 +110,9 @@ def test_the_prior_knows_only_the_commonest_answer_of_a_sub_scenario() -> None:
 @pytest.mark.promise
 def test_released_records_carry_evidence_that_holds() -> None:
     specs = list(load_released().values())
-    assert unanswerable_controls(specs) == []
-    assert answerable_voids(specs) == []
-    assert answerable_ill_posed(specs) == []
+    assert failed_certificates(specs, "control") == []
+    assert failed_certificates(specs, "void", "twin", "worlds") == []
+    assert failed_certificates(specs, "words") == []
 
 
 def test_no_released_family_has_an_answer_or_a_text_too_often() -> None:
@@ -125,9 +125,9 @@ def test_no_released_family_has_an_answer_or_a_text_too_often() -> None:
 
 def test_a_record_whose_cut_was_moved_is_found_without_a_trajectory() -> None:
     spec = load_released()["plinko-0001"]
-    assert list(answerable_voids([spec])) == []
+    assert list(failed_certificates([spec], "void", "twin", "worlds")) == []
     early = spec.model_copy(update={"void": spec.void | {"cut_frame": 9}})  # its last frame is shown at 0.8 s
-    assert is_one(answerable_voids([early]), "plinko-0001: cut", "0.9 s", "1.0 s")
+    assert is_one(failed_certificates([early], "void", "twin", "worlds"), "plinko-0001: cut", "0.9 s", "1.0 s")
 
 
 def test_a_record_without_evidence_loses_every_certificate_that_stores_some() -> None:
@@ -144,7 +144,7 @@ def test_a_record_without_evidence_loses_every_certificate_that_stores_some() ->
         "closing": "read_s",
         "exchange": "hidden_from_s",
     }
-    said = [*unanswerable_controls([bare]), *answerable_voids([bare])]
+    said = [*failed_certificates([bare], "control"), *failed_certificates([bare], "void", "twin", "worlds")]
     assert [one.split(": ")[1] for one in said] == [*lost]
     assert all(f"'{evidence}'" in one for evidence, one in zip(lost.values(), said, strict=True))
 

@@ -6,19 +6,20 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.build.recorded import WORDS, ball, balls, film, table
+from tests.build.recorded import TWO_EVENTS, WORDS, ball, balls, film, table
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.benchmark.footage import UnusableFootage
-from traps_pipeline.benchmark.import_recorded import RECORDS, import_recorded
-from traps_pipeline.benchmark.leaks import measure_leaks
+from traps_pipeline.benchmark.import_recorded import RECORDS, RecordedSpec, import_recorded
+from traps_pipeline.benchmark.leaks import FILE, measure_leaks
 from traps_pipeline.benchmark.recorded_clips import clip_path, make_clips
 from traps_pipeline.benchmark.recorded_pairs import read_pairs
-from traps_pipeline.benchmark.records import is_recorded, load_released
+from traps_pipeline.benchmark.records import is_recorded, load_released, parse_two_events, two_events_lines
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.video.encode import decode
 
@@ -95,6 +96,43 @@ def test_a_twin_proves_a_void_byte_for_byte_or_is_said_to_differ(tmp_path: Path,
     assert not np.array_equal(made.clips["twin"][-1], made.clips["control"][-1])
 
 
+def test_two_events_of_one_recording_are_hidden_by_themselves_both_or_not_at_all(tmp_path: Path) -> None:
+    made = clips_of(one(tmp_path, **TWO_EVENTS, control_cover="2.5 3 0 80 150 160|2.5 3 160 80 160 160"))
+    frames = {name: np.stack(clip) for name, clip in made.clips.items()}
+    assert {*frames} == {"neither", "left", "right", "both"}
+    halves = {name: (clip[:, :, :160], clip[:, :, 160:]) for name, clip in frames.items()}
+    # Each half shows the same whether or not the other one is hidden.
+    for half, same in enumerate((("neither", "right"), ("left", "both")), start=0):
+        assert np.array_equal(halves[same[0]][0], halves[same[1]][0]), half
+    assert np.array_equal(halves["neither"][1], halves["left"][1])
+    assert np.array_equal(halves["right"][1], halves["both"][1])
+    hidden = (frames["left"] != frames["neither"]).any(axis=-1)
+    assert hidden[12:25, 80:240, :150].any() and not hidden[:, :, 150:].any()
+    assert not hidden[25:].any()  # by then a board stands in each clip
+    assert made.void == {
+        "hides": [[(12, 30)]] * 2, "stands": [[(25, 30)]] * 2, "cover": [[0, 80, 150, 160], [160, 80, 160, 160]]
+    }  # fmt: skip
+
+
+def test_a_recording_of_two_events_becomes_eight_questions(tmp_path: Path) -> None:
+    folder, out = balls(tmp_path / "in", 1, events=1), tmp_path / "out"
+    (_, record), problems = import_recorded(folder, out, "some", workers=1)
+    assert problems == []
+    released = out / "two_events" / "released"
+    (line,) = two_events_lines(released).values()
+    assert line.spec == record
+    for name, value in (("clips", {"both": "0"}), ("question", "Where?"), ("physics", {"fps": 10})):
+        with pytest.raises(TrapsError, match=name):
+            parse_two_events(json.dumps(json.loads(line.line) | {name: value}), "line 1")
+    asked = {(q.item.name, q.text.split(" reach")[0], q.answer) for q in line.spec.questions()}
+    red, blue = ("Which side does the red ball", "Which side does the blue ball")
+    assert asked == {
+        ("left.neither", red, "left"), ("right.neither", blue, "right"), ("left.left", red, None),
+        ("right.left", blue, "right"), ("left.right", red, "left"), ("right.right", blue, None),
+        ("left.both", red, None), ("right.both", blue, None),
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("row", "reason"),
     [
@@ -105,7 +143,7 @@ def test_a_twin_proves_a_void_byte_for_byte_or_is_said_to_differ(tmp_path: Path,
         ({"cut_s": "1", "choices": "left"}, "choices"),
         ({"cut_s": "1", "id": "Ball 1"}, "id"),
         ({"cut_s": "1", "aliases": "links"}, "other=choice"),
-        ({"cut_s": "1", "aliases": "links=rechts"}, "aliases name 'rechts'"),
+        ({"cut_s": "1", "aliases": "links=rechts"}, "unknown labels ['rechts']"),
         ({"cut_s": "1", "start_s": "2"}, "between start_s and end_s"),
         ({"cover": "2 1 0 0 90 90"}, "from_s to_s x y width height"),
         ({"cover": "1 2 0 0 90"}, "cover"),
@@ -119,7 +157,13 @@ def test_a_twin_proves_a_void_byte_for_byte_or_is_said_to_differ(tmp_path: Path,
         ({"cut_s": "2.9"}, "cut half a second or more"),
         ({"cover": "1 2 300 0 90 90"}, "leaves the picture, which is 320 x 240"),
         ({"cover": "9 10 0 0 90 90"}, "begins after the clip's end"),
-        ({"two_events": "yes", "cut_s": "1"}, "two_events are not imported yet"),
+        ({"two_events": "a|b", "cut_s": "1", "answer": "left|right"}, "and a cover for each"),
+        ({"two_events": "a|b", "cover": "1 2 0 0 90 90", "answer": "left"}, "two answers and two boards"),
+        ({"cover": "1 2 0 0 90 90|1 2 99 0 90 90"}, "a pair has one of each"),
+        (TWO_EVENTS | {"question": "Which side?"}, "for {} in the question"),
+        (TWO_EVENTS | {"two_events": "red|red"}, "two names"),
+        (TWO_EVENTS | {"cover": "1 2 0 0 90 90|1 2 80 0 90 90"}, "stand side by side"),
+        (TWO_EVENTS | {"control_cover": "1 2 0 0 90 90|1 2 80 0 90 90"}, "stand side by side"),
     ],
 )
 def test_a_wrong_line_gets_one_sentence(tmp_path: Path, row: dict[str, str], reason: str) -> None:
@@ -192,6 +236,10 @@ def test_a_benchmark_of_both_kinds_is_refused(tmp_path: Path) -> None:
             act()
 
 
+def pairs_of(records: Sequence[RecordedSpec]) -> list[SceneSpec]:
+    return [record for record in records if isinstance(record, SceneSpec)]
+
+
 def noisy(answer: str, number: int) -> list[np.ndarray]:
     """Return a ball's frames with a sensor's noise."""
     rng = np.random.default_rng([number, *answer.encode()])
@@ -201,7 +249,7 @@ def noisy(answer: str, number: int) -> list[np.ndarray]:
 
 def test_a_leak_that_was_planted_is_found(tmp_path: Path) -> None:
     """Voids that were encoded twice, coarsely, differ in detail from all controls; others do not."""
-    p_of_detail = {}
+    j_of_detail = {}
     for planted in (False, True):
         folder, rows = tmp_path / str(planted), []
         for k in range(6):
@@ -212,10 +260,11 @@ def test_a_leak_that_was_planted_is_found(tmp_path: Path) -> None:
             rows.append({"id": f"balls-{k}", "control": f"{k}.mp4", "void": f"{k}v.mp4", "answer": "left"})
         records, problems = import_recorded(table(folder, rows), folder / "out", "some", workers=1)
         assert problems == []
-        lines = measure_leaks(records, folder / "out").splitlines()
-        p_of_detail[planted] = float([line for line in lines if line.startswith("detail")][-1].split()[-1])
-    assert p_of_detail[True] == pytest.approx(2 / 2**6, abs=0.001)  # as if a coin fell alike six times
-    assert p_of_detail[False] > 0.05
+        measure_leaks(pairs_of(records), folder / "out")
+        rows = json.loads((folder / "out" / FILE).read_text(encoding="utf-8"))
+        (j_of_detail[planted],) = (row["j"] for row in rows if row["cue"] == "detail")
+    assert j_of_detail[True] == 1
+    assert j_of_detail[False] < 0.5
 
 
 def test_the_same_clip_under_two_names_is_a_near_duplicate(tmp_path: Path) -> None:
@@ -225,7 +274,7 @@ def test_the_same_clip_under_two_names_is_a_near_duplicate(tmp_path: Path) -> No
         film(folder / f"{k}.mp4", ball("left", number), options={"crf": str(16 + k), "preset": "ultrafast"})
         rows.append({"id": f"balls-{k}", "control": f"{k}.mp4", "answer": "left", "cut_s": "1.2"})
     records, _ = import_recorded(table(folder, rows), tmp_path / "out", "some", workers=1)
-    lines = [line for line in measure_leaks(records, tmp_path / "out").splitlines() if "nearly" in line]
+    lines = [line for line in measure_leaks(pairs_of(records), tmp_path / "out").splitlines() if "nearly" in line]
     assert [line.split(":")[0] for line in lines] == ["balls-0 and balls-2"]
 
 

@@ -76,7 +76,7 @@ def test_a_scenario_of_two_events_is_discarded_restored_and_reworded_in_both_lan
     [
         ({"action": "correct", "params": {"radius_m": 0.1}}, "discard it"),
         ({"action": "correct", "answer": "yes"}, "discard it"),
-        ({"action": "correct", "labels": ["a", "b"]}, "ground truths"),
+        ({"action": "correct", "labels": ["a", "b"]}, "is not one of"),
         ({"action": "correct"}, "no change"),
         ({"action": "keep", "question": "Why?"}, "keep"),
     ],

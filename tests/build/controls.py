@@ -68,8 +68,9 @@ def interaction() -> pd.DataFrame:
     for prompt, auroc, within in (("guided", 0.8, 0.9), ("random_0", 0.5, 0.5)):
         at = {"prompt": prompt, "features": "states", "layer": 3, "held_out": "families", "chosen": True}
         at |= {"auroc": auroc, "within": within, "confound": 0.95, "own_effect": 1.0, "other_effect": 0.0}
-        others = ({"layer": 4, "chosen": False}, {"features": "words", "layer": -1}, {"held_out": "scenarios"})
+        others = ({"layer": 4, "chosen": False}, {"held_out": "scenarios"})
         rows += [at, *(at | other | {"auroc": 1.0, "within": 1.0} for other in others)]
+        rows.append(at | {"features": "words", "layer": -1, "auroc": 0.5, "within": 0.5, "same": 1.0})
     return frame(INTERACTION, *rows)
 
 
@@ -96,7 +97,7 @@ def item_scores() -> pd.DataFrame:
     """Two voids, both answered: states rank them above both controls, the output between them."""
     scored = (("void", 2.0, -3.0), ("void", 1.0, -1.0), ("control", -1.0, -2.0), ("control", -4.0, -4.0))
     about = {"dataset": "chaotic", "abstained_standard": False}
-    rows = [about | {"item_id": str(n), "side": s, "own": own, "others": own, "margin": m}
+    rows = [about | {"item_id": str(n), "side": s, "others": own, "margin": m}
             for n, (s, own, m) in enumerate(scored)]  # fmt: skip
     return frame(ITEM_SCORES, *rows)
 
@@ -114,6 +115,7 @@ def lens() -> pd.DataFrame:
         {"dataset": "chaotic", "prompt": prompt, "layer": layer, "voids": float(voids), "controls": float(controls)}
         for (prompt, layer), (voids, controls) in at.items()
     ]
+    rows[2]["auroc"] = 0.9  # under standard, at the output
     return frame(LENS, *rows)
 
 
@@ -153,7 +155,7 @@ class Made(Results):
 
     source, is_study = "made up", True
     prompted_probes = cached_property(lambda _: probes())
-    prompted_baselines = cached_property(lambda _: baselines())
+    baselines = cached_property(lambda _: baselines())
     gate = cached_property(lambda _: gate())
     patching = cached_property(lambda _: patching())
     item_scores = cached_property(lambda _: item_scores())

@@ -16,6 +16,10 @@ WORDS = {
     "source": "filmed in a test", "licence": "CC0-1.0",
 }  # fmt: skip
 ANSWERS = ("left", "right")
+TWO_EVENTS = {
+    "two_events": "the red ball|the blue ball", "question": "Which side does {} reach, left or right?",
+    "answer": "left|right", "cover": "1.2 3 0 80 150 160|1.2 3 160 80 160 160",
+}  # fmt: skip
 
 
 def ball(answer: str, number: int = 0, *, n: int = 60, size: tuple[int, int] = (320, 240)) -> list[np.ndarray]:
@@ -71,9 +75,9 @@ def table(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     return folder
 
 
-def balls(folder: Path, n: int) -> Path:
-    """Write n pairs: covered ones with a twin, and ones that are cut, in turn."""
-    rows = []
+def balls(folder: Path, n: int, *, events: int = 0) -> Path:
+    """Write n pairs: covered ones with a twin, and ones that are cut, in turn; and recordings of two events."""
+    rows: list[dict[str, str]] = []
     for number in range(n):
         answer, other = ANSWERS[number % 2], ANSWERS[1 - number % 2]
         film(folder / f"{number}.mp4", ball(answer, number))
@@ -86,4 +90,8 @@ def balls(folder: Path, n: int) -> Path:
         else:
             row["cut_s"] = "1.2"
         rows.append(row)
+    for number in range(events):
+        pictures = [np.hstack(both) for both in zip(*(ball(a, number, size=(160, 240)) for a in ANSWERS), strict=True)]
+        film(folder / f"events-{number}.mp4", pictures)
+        rows.append({"id": f"balls-e{number + 1:03d}", "control": f"events-{number}.mp4", **TWO_EVENTS})
     return table(folder, rows)

@@ -19,6 +19,7 @@ EXPERIMENT = """
 name: balls
 benchmark: balls
 models: [oracle, always-abstain]
+datasets: [occlusion, occlusion_ill_posed, chaotic, chaotic_ill_posed, two_events]
 regimes: [standard]
 panel: rules
 """
@@ -47,6 +48,24 @@ from pathlib import Path
 from traps_pipeline.people.recorded_certificates import certification_note
 from traps_pipeline.storage.workspace import Workspace
 print(certification_note(Workspace.open(Path(sys.argv[1])).tables))
+"""
+FIGURES = """
+import json
+import sys
+from pathlib import Path
+from matplotlib.text import Text
+from traps_pipeline.report.cards import Sources
+from traps_pipeline.report.catalogue import FIGURE_REPORTS
+from traps_pipeline.report.writing import NotRun
+from traps_pipeline.storage.workspace import Workspace
+study, said = Sources(Workspace.open(Path(sys.argv[1]))).study, []
+for report in FIGURE_REPORTS:
+    try:
+        figure = report.figure(study)
+    except NotRun:
+        continue
+    said.append(any("not certified" in text.get_text() for text in figure.findobj(Text)))
+print(json.dumps(said))
 """
 
 
@@ -77,23 +96,33 @@ class Folder:
     def note(self) -> str:
         return self.python("-W", "ignore", "-c", NOTE, self.study).stdout
 
+    def figures(self) -> set[bool]:
+        """Return whether the figures say that pairs are not certified."""
+        printed = self.python("-W", "ignore", "-c", FIGURES, self.study)
+        said = json.loads(printed.stdout)
+        assert len(said) >= 2, printed.stderr
+        return {*said}
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     root = tmp_path_factory.mktemp("recorded")
     made = Folder(root)
-    done = made.traps("benchmark", "import", balls(root / "videos", 6), "--out", made.benchmark)
+    done = made.traps("benchmark", "import", balls(root / "videos", 6, events=1), "--out", made.benchmark)
     assert done.returncode == 0, done.stderr
     return made
 
 
 def test_recorded_pairs_are_asked_certified_corrected_and_released(folder: Folder) -> None:
-    assert "48 answers asked" in folder.run("leaderboard")  # 2 models, 6 scenarios, 2 questions, 2 sides
-    assert "not certified: 0 of 6" in folder.note()
+    assert "64 answers asked" in folder.run("two_way")  # 2 models, 6 scenarios of 4 items, and one of 8
+    folder.run("leaderboard")
+    assert "not certified: 0 of 7" in folder.note()
+    assert folder.figures() == {True}
     sampled = folder.python("-W", "ignore", "-c", LABEL, folder.study, *PEOPLE)
     assert sampled.stdout.strip() == "[3, 3, 3, 3]", sampled.stderr  # every clip, on both sides
     assert "0 answers asked" in folder.run("human_row")
-    assert "all 6 certified" in folder.note()
+    assert "all 7 certified" in folder.note()
+    assert folder.figures() == {False}
 
     decision = {"scenario_id": "balls-0002", "action": "correct", "question": "Where does it go, left or right?"}
     corrections = folder.benchmark / "corrections"
@@ -101,7 +130,7 @@ def test_recorded_pairs_are_asked_certified_corrected_and_released(folder: Folde
     line = decision | {"who": "jd", "when": "2026-11-28", "why": "plainer"}
     (corrections / "review.jsonl").write_text(json.dumps(line) + "\n", encoding="utf-8")
     assert "6 answers asked" in folder.run("human_row")  # of 2 models: all but the ill-posed void
-    assert "not certified: 5 of 6" in folder.note()
+    assert "not certified: 6 of 7" in folder.note()
 
     released = folder.root / "released"
     done = folder.traps("publish", "release", released, "--workspace", folder.study)
@@ -127,7 +156,7 @@ def test_what_needs_physics_says_once_that_it_is_not_for_recorded_pairs(
     folder: Folder, arguments: tuple[str, ...]
 ) -> None:
     (folder.root / "observer.yaml").write_text(EXPERIMENT.replace("oracle", "observer"), encoding="utf-8")
-    (folder.root / "arms.yaml").write_text(f"{EXPERIMENT}datasets: [occlusion, twin_control]\n", encoding="utf-8")
+    (folder.root / "arms.yaml").write_text(EXPERIMENT.replace("two_events", "twin_control"), encoding="utf-8")
     done = folder.traps(*arguments)
     assert done.returncode == 1
     assert (done.stdout + done.stderr).count("not for recorded pairs") == 1

@@ -7,6 +7,8 @@ import doctest
 import inspect
 import io
 import json
+import re
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from tests.build.errors import raises
-from tests.build.mechanism import STANDARD, entry, patch
+from tests.build.mechanism import STANDARD, entry, extract_all, patch
 from tests.build.mechanism import study as extracted
 from tests.mechanism.study import PAIRS, write_verdicts
 from tools.inside_notebook import NOTEBOOK, execute
@@ -30,13 +32,15 @@ from traps_pipeline.mechanism.baselines import RAW
 from traps_pipeline.mechanism.gate import SOURCES, THRESHOLDS, gate_answers
 from traps_pipeline.mechanism.gating import gate_items, gate_rows, gate_table
 from traps_pipeline.mechanism.hook import Steering
-from traps_pipeline.mechanism.live_gate import ABSTENTION
+from traps_pipeline.mechanism.layer_choice import pair_curves
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS, PROBES
+from traps_pipeline.mechanism.notebook import ABSTENTION
 from traps_pipeline.mechanism.probes import scenario_folds
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry.entries import ModelEntry
-from traps_pipeline.models.registry.prompts import vqa_prompt
+from traps_pipeline.models.registry.prompts import system_prompt, vqa_prompt
+from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.storage.media import pick_frames
 from traps_pipeline.storage.workspace import Workspace
 
@@ -47,8 +51,10 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def study(extracted: Workspace) -> Workspace:
-    """Extracted, with directions, and judged on one dataset."""
+    """Extracted, with directions and probes, and judged on one dataset."""
     write_verdicts(extracted, "chaotic", {f"plinko-{n}": n < 2 for n in range(PAIRS)})
+    extracted.tables.write(PROBES, STANDARD.partition, stages.probe_rows(extracted, STANDARD), {})
+    extract_all(extracted, ["occlusion"], Extraction("tiny", "guided"))
     return extracted
 
 
@@ -56,9 +62,8 @@ def test_the_notebook_runs_as_it_is_written(study: Workspace) -> None:
     cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
     blocks = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     code = "\n".join(blocks).replace('".workspaces/mechanism"', repr(str(study.root))).replace('"pocket"', '"tiny"')
-    assert len(blocks) >= 6
-    names = execute([{"cell_type": "code", "source": [code]}])
-    assert not torch.equal(names["pushed"], names["plain"])  # type: ignore[arg-type]
+    assert len(blocks) >= 8
+    execute([{"cell_type": "code", "source": [code]}])
 
 
 def test_states_stand_beside_their_items_and_verdicts(study: Workspace) -> None:
@@ -68,7 +73,7 @@ def test_states_stand_beside_their_items_and_verdicts(study: Workspace) -> None:
     judged = states.where("dataset == 'chaotic' and void").items.set_index("scenario_id")["abstained_standard"]
     assert judged.astype(bool).to_dict() == {f"plinko-{n}": n < 2 for n in range(PAIRS)}
     assert states.where(states.void).items["side"].unique().tolist() == ["void"]
-    with raises(TrapsError, "inside.load", "twin_control"):
+    with raises(TrapsError, "mechanism.notebook.check_name", "twin_control"):
         inside.load(study.root, "tiny", layer=2, datasets=["twin_control"])
 
 
@@ -92,7 +97,8 @@ def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry:
     expected = model.forward_states(prompt).raw
     plain.remove()
     with push.apply(model, 5.0, site="attention"):
-        assert (model.forward_states(prompt).raw == expected).all() and (expected[2] != before[2]).any()
+        changed = model.forward_states(prompt).raw  # along the unit vector, whose length is 1 but for rounding
+    assert changed == pytest.approx(expected, abs=1e-4) and np.abs(expected[2] - before[2]).max() > 1e-2
     assert (model.forward_states(prompt).raw == before).all()  # every hook is gone
     with raises(TrapsError, "inside.Direction.apply", "amount", "gaps"), push.apply(model, 1.0, gaps=1.0):
         pass
@@ -101,7 +107,6 @@ def test_a_direction_of_the_api_steers_as_the_stages_do(study: Workspace, entry:
 
 
 def test_a_gate_is_made_from_states_and_verdicts_that_exist(study: Workspace, entry: ModelEntry) -> None:
-    study.tables.write(PROBES, STANDARD.partition, stages.probe_rows(study, STANDARD), {})
     states = StoredStates.of(study, STANDARD)
     rows = pd.DataFrame(gate_rows(study, entry, states))
     assert set(rows["regime"]) == {"standard"} and set(rows["threshold"]) == {"mid", "J", "conformal"}
@@ -117,7 +122,6 @@ def test_a_gate_is_made_from_states_and_verdicts_that_exist(study: Workspace, en
 
 def test_a_gate_in_memory_decides_as_the_gate_stage_counts(study: Workspace, entry: ModelEntry) -> None:
     """`gate_answers` holds folds of scenarios out; the gate without such a fold decides the same about its items."""
-    study.tables.write(PROBES, STANDARD.partition, stages.probe_rows(study, STANDARD), {})
     model, states, settings = load_local_model(entry), StoredStates.of(study, STANDARD), study.mechanism
     items = study.tables.read(PROBE_ITEMS, {"dataset": "chaotic"}).set_index("item_id")
     assert entry.media is not None
@@ -174,6 +178,81 @@ def test_the_protocol_takes_any_probe_and_any_features_of_items(study: Workspace
         inside.protocol(study, "tiny", layer=2, features=inside.LoadedStates(some.X[2:], some.items.iloc[2:]))
 
 
+def test_a_prompt_of_an_item_is_what_the_study_read_and_asked(study: Workspace, entry: ModelEntry) -> None:
+    states = inside.load(study, "tiny", layer=2, datasets=["chaotic"])
+    model, item = load_local_model(entry, inside=True), str(states.items["item_id"][1])
+    assert (model.forward_states(inside.prompt(study, item)).raw[2] == states.X[1]).all()
+    shown = inside.prompt(study, item, regime="guided", system="benchmark")
+    assert system_prompt("guided") in shown.text and shown.text != inside.prompt(study, item, regime="guided").text
+
+
+def test_the_layer_is_the_studys_where_none_is_named(study: Workspace) -> None:
+    probes = study.tables.read(PROBES, STANDARD.partition)
+    chosen = probes.loc[probes["chosen"].eq(True) & (probes["analysis"] == "transfer")].set_index("target")["layer"]
+    layers = {name: inside.layer(study, "tiny", name) for name in ("chaotic", "occlusion")}
+    assert layers == {name: set(chosen[name]).pop() for name in layers}
+    of_own = inside.load(study, "tiny", datasets=["chaotic"])
+    assert (of_own.X == inside.load(study, "tiny", layer=layers["chaotic"], datasets=["chaotic"]).X).all()
+    assert inside.direction(study, "tiny", "occlusion").layer == layers["occlusion"]
+    rows = inside.protocol(study, "tiny")
+    assert {*rows.loc[rows["target"] == "chaotic", "layer"]} == {layers["chaotic"]}
+
+
+def test_a_sweep_is_the_protocol_at_each_layer_beside_what_swapped_labels_give(study: Workspace) -> None:
+    rows = inside.sweep(study, "tiny", draws=4)
+    for layer, value in zip(rows["layer"], rows["value"], strict=True):
+        curves = pair_curves(inside.protocol(study, "tiny", layer=layer).to_dict("records"))
+        assert value == pytest.approx(np.mean([curve[layer] for curve in curves.values()]))
+    assert (rows["null_low"] <= rows["null_high"]).all() and (rows["best_null"] >= rows["null_low"].max()).all()
+    assert (rows.loc[0, ["value", "null_low", "null_high"]] == 0.5).all()  # the embedding of one and the same token
+
+
+def test_no_repr_prints_an_array(study: Workspace, entry: ModelEntry) -> None:
+    states = inside.load(study, "tiny", layer=2)
+    objects = [
+        states,
+        inside.gate(study, "tiny", source="one:chaotic", layer=2),
+        inside.fit_probe(states.X, states.void),
+    ]
+    objects += [inside.direction(study, "tiny", "chaotic", layer=2), inside.prompt(study, states.items["item_id"][0])]
+    objects.append(inside.load_model(study, "tiny").forward_states(objects[-1]))  # type: ignore[arg-type]
+    for thing in objects:
+        assert not {"array", "tensor"} & {*re.findall("[a-z]+", repr(thing))} and len(repr(thing)) < 1000
+    assert repr(states).startswith(f"LoadedStates({len(states.X)} x 64, chaotic")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "names"),
+    [
+        (lambda study: inside.prompt(study, "chaotic:plinko-9:void"), ("plinko-9",)),
+        (lambda study: inside.prompt(study, "chaos:plinko-0:void"), ("chaos", "chaotic")),
+        (lambda study: inside.prompt(study, "chaotic:plinko-0:void", regime="gided"), ("gided", "guided")),
+        (lambda study: inside.prompt(study, "chaotic:plinko-0:void", system="qva"), ("qva",)),
+        (lambda study: inside.load(study, "tinny"), ("tinny", "tiny")),
+        (lambda study: inside.load(study, "pocket"), ("pocket", "tiny")),
+        (lambda study: inside.load(study, "tiny", prompt="gided"), ("gided", "guided")),
+        (lambda study: inside.load(study, "tiny", layer=9), ("9", "normed")),
+        (lambda study: inside.load(study, "tiny", layer="norm"), ("norm", "normed")),
+        (lambda study: inside.load(study, "tiny", datasets=["caotic"]), ("caotic", "chaotic")),
+        (lambda study: inside.load(study, "tiny").where("datset == 'chaotic'"), ("datset", "dataset")),
+        (lambda study: inside.load(study, "tiny").where([True]), ("1",)),
+        (lambda study: inside.layer(study, "tiny", "caotic"), ("caotic", "chaotic")),
+        (lambda study: inside.protocol(study, "tiny", layer=9), ("9", "normed")),
+        (lambda study: inside.direction(study, "tiny", "caotic"), ("caotic", "chaotic")),
+        (lambda study: inside.direction(study, "tiny", "chaotic", kind="nul"), ("nul", "covariance")),
+        (lambda study: inside.direction(study, "tiny", "chaotic", layer=9), ("9",)),
+        (lambda study: inside.gate(study, "tiny", source="one:chaotic", layer=9), ("9",)),
+        (lambda study: inside.load_model(study, "pocket"), ("pocket",)),
+    ],
+)
+def test_a_wrong_name_is_answered_in_one_line_that_names_it_and_what_there_is(
+    study: Workspace, wrong: Callable[[Workspace], object], names: tuple[str, ...]
+) -> None:
+    with raises(TrapsError, "", *names) as caught:
+        wrong(study)
+    assert "\n" not in str(caught.value)
+
+
 def public_objects() -> dict[str, object]:
     """What `inside` gives: its own functions and classes, those that it passes on, and their methods."""
     names = {name: value for name, value in vars(inside).items() if not name.startswith("_")}
@@ -184,13 +263,12 @@ def public_objects() -> dict[str, object]:
     own = {name: value for name, value in names.items() if getattr(value, "__module__", "") == inside.__name__}
     found = {name: value for name, value in (own | {n: names[n] for n in passed_on}).items() if value.__doc__}
     for owner in (value for value in own.values() if inspect.isclass(value)):
-        methods = {name: value for name, value in vars(owner).items() if not name.startswith("__") or name == "__neg__"}
+        methods = {name: value for name, value in vars(owner).items() if not name.startswith("_")}
         found |= {f"{owner.__name__}.{name}": value for name, value in methods.items() if value.__doc__}
     return {name: value for name, value in found.items() if callable(value) or isinstance(value, property)}
 
 
 def test_every_public_docstring_has_an_example_that_gives_what_it_says(study: Workspace, entry: ModelEntry) -> None:
-    study.tables.write(PROBES, STANDARD.partition, stages.probe_rows(study, STANDARD), {})
     model = load_local_model(entry)
     prompt = model.prompt("Look.", "Which?", np.full((2, 32, 32, 3), 90, np.uint8), [0.0, 1.0])
     names = {"inside": inside, "np": np, "local_model": model, "prompt": prompt}

@@ -7,8 +7,13 @@ import pytest
 import yaml
 
 from tests.conftest import EXPERIMENT, Checkout
+from traps_pipeline import inside
 from traps_pipeline.mechanism.control_rows import INTERACTION
 from traps_pipeline.mechanism.interaction import LaneDesign, figures_of
+from traps_pipeline.mechanism.stored_states import StoredStates
+from traps_pipeline.models.local.adapter import load_local_model
+from traps_pipeline.models.registry.entries import get_model
+from traps_pipeline.protocol.cells import Extraction
 from traps_pipeline.protocol.two_events import lane_items
 from traps_pipeline.storage.workspace import Workspace
 
@@ -44,6 +49,7 @@ def test_what_clip_and_question_tell_apart_adds_up_to_chance_within_every_clip()
     noise = np.random.default_rng(0).standard_normal((DESIGN.clips.max() + 1, 5))[DESIGN.clips]
     found = figures(np.column_stack([questions, noise]), "scenarios")
     assert (found["within"], found["auroc"]) == (0.5, pytest.approx(0.5, abs=0.02))
+    assert found["same"] == 0 and figures(noise, "scenarios")["same"] == 1  # what is of the clip alone
 
 
 def test_families_are_not_held_out_where_there_is_one() -> None:
@@ -73,5 +79,11 @@ def test_traps_run_reads_two_events_in_the_pocket_and_in_its_random_weights(own_
     assert {*rows["prompt"]} == {"guided", "random_0", "random_1"}
     states, rivals = (rows.loc[rows["layer"].ge(0) == of_states] for of_states in (True, False))
     assert len(states) == 3 * 2 * 5 and {*states.loc[states["chosen"]].groupby(["prompt", "held_out"]).size()} == {1}
-    assert {*rivals["features"]} == {"pixels", "words", "both added"}
-    assert rivals[["auroc", "within"]].to_numpy() == pytest.approx(0.5)
+    raw = rivals["features"].isin(["pixels", "words", "both added", "length"])
+    assert {*rivals.loc[~raw, "features"]} == {"output margin", "first-token logits"} and raw.sum() == 3 * 4 * 2
+    assert rivals.loc[raw, ["auroc", "within"]].to_numpy() == pytest.approx(0.5)
+    # Random weights are read under the prompt that the model is read under.
+    random = StoredStates.of(Workspace.open(workspace), Extraction("pocket", "random_0"), ["two_events"])
+    prompt = inside.prompt(workspace, random.items["item_id"][0], regime="guided")
+    network = load_local_model(get_model("pocket"), inside=True, seed=0)
+    assert (random.read("two_events", 4)[0] == network.forward_states(prompt).raw[4]).all()

@@ -68,6 +68,12 @@ def test_pairs_with_the_target_do_not_count_and_pairs_of_one_taxonomy_count_as_h
     assert both.curve == pytest.approx({0: 0.7, 1: 0.55, 2: 0.65}) and both.layer == 0
 
 
+def test_a_layer_of_states_that_are_one_for_all_items_is_never_chosen_where_another_one_varies() -> None:
+    constant = row("transfer", "chaotic", "occlusion", 0.5, 0.4, 0.3)  # of random weights: the embedding is the best
+    assert layer_choice(pair_curves(constant), "chaotic_ill_posed").layer == 1
+    assert layer_choice(pair_curves(row("transfer", "chaotic", "occlusion", 0.5, 0.5))).layer == 0
+
+
 def test_of_a_plateau_the_middle_is_taken_and_two_datasets_fall_back_on_the_other_one() -> None:
     flat = row("held_out", "chaotic", "chaotic", 0.5, 1.0, 1.0, 1.0, 0.9)
     flat += row("transfer", "chaotic", "occlusion", 0.1, 0.2, 0.3, 0.4, 0.5)

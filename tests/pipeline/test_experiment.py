@@ -83,6 +83,19 @@ def test_an_arm_of_an_earlier_version_is_answered_with_what_takes_its_place(tmp_
         load_experiment(experiment(tmp_path, "datasets: [occlusion, crossed]\n"))
 
 
+@pytest.mark.parametrize(
+    ("datasets", "scenarios"),
+    [("[two_events]", "[slide-e001]"), ("[length_matched]", "[plinko-0001]"), ("[occlusion]", "[plinko-0001]")],
+)
+def test_an_experiment_that_looks_inside_without_pairs_is_refused_before_anything_is_made(
+    tmp_path: Path, datasets: str, scenarios: str
+) -> None:
+    inside = "mechanism: {models: {pocket: {steering: 3, centroid: 4}}}\n"
+    with raises(TrapsError, "base.yamlfile.name_file_in_errors", "my.yaml", datasets[1:-1], *DATASETS):
+        load_experiment(experiment(tmp_path, f"datasets: {datasets}\nscenarios: {scenarios}\n{inside}"))
+    load_experiment(experiment(tmp_path, f"datasets: {datasets}\nscenarios: {scenarios}\n"))
+
+
 def test_an_unknown_model_or_experiment_is_answered_with_the_known_ones(tmp_path: Path) -> None:
     path = tmp_path / "other.yaml"
     path.write_text("name: other\nmodels: [oracle, gpt-6]\n")

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.build.controls import Made, effects, gate, item_scores, patching, probes
+from tests.build.controls import Made, effects, gate, item_scores, patching
 from traps_pipeline.report import publish, study_results
 from traps_pipeline.report.cards import Sources, figure_card, table_card
 from traps_pipeline.report.catalogue import FIGURE_REPORTS, INSIDE, TABLE_REPORTS
@@ -53,7 +53,12 @@ def test_claims_stand_beside_random_weights_placebos_and_the_best_rival() -> Non
     table, _, rivals = claim_tables(Made())
     rows = {row["Claim"]: row for row in cells(table)}
     lead = rows["states tell visual voids better than all rivals"]
-    assert [lead[name] for name in ("model", "random 0", "random 1", "placebo")] == ["0.200", "0.150", "–", "0.050"]
+    assert [lead[name] for name in ("model", "random 0", "random 1", "placebo")] == [
+        "0.200",
+        "0.150",
+        "not run",
+        "0.050",
+    ]
     assert lead["Verdict"] == "holds in random 0 too"
     assert rows["states tell visual voids better than the output"]["model"] == "0.250"  # .9 less .65 of the logits
     own, *_ = cells(rivals)
@@ -68,7 +73,12 @@ def test_the_first_claim_is_the_interaction_at_the_chosen_layer_with_families_he
     made.two_way = pd.DataFrame([answers]).reindex(columns=pd.Index(TWO_WAY.names))
     claims_of, table, _ = claim_tables(made)
     first = cells(claims_of)[0]
-    assert [first[name] for name in ("model", "random 0", "random 1", "Verdict")] == ["0.800", "0.500", "–", "holds"]
+    assert [first[name] for name in ("model", "random 0", "random 1", "Verdict")] == [
+        "0.800",
+        "0.500",
+        "not run",
+        "holds",
+    ]
     rows = {(row["Prompt"], row["Read from"], row["Held out"]): row for row in cells(table)}
     own, words = (rows["guided", features, "families"] for features in ("states", "words"))
     assert (own["Within a clip"], own["Confound"], own["Answers: own"], own["other"]) == (
@@ -78,10 +88,17 @@ def test_the_first_claim_is_the_interaction_at_the_chosen_layer_with_families_he
         "0.60",
     )
     assert words["Answers: own"] == rows["random_0", "states", "families"]["Answers: own"] == "–"
-    made.interaction = made.interaction.assign(within=0.9)  # random weights of which the AUROC alone is at chance
-    assert claim_frame(made)["verdict"].iloc[0] == "holds"
-    made.interaction = made.interaction.assign(auroc=0.9)
-    assert claim_frame(made)["verdict"].iloc[0] == "holds in random 0 too"
+    assert (first["best rival"], first["placebo"], first["pocket, no gap"]) == ("0.500", "same clip", "not run")
+    rows, is_rival = made.interaction, made.interaction["features"] == "words"
+    for changed, expected in (
+        ({"within": 0.9}, "holds"),  # the AUROC of random weights and of rivals is at chance
+        ({"auroc": 0.9, "within": rows["within"].where(is_rival, 0.9)}, "holds in random 0 too"),
+        ({"auroc": 0.9, "within": rows["within"].mask(is_rival, 0.9)}, "holds in best rival too"),
+        ({"same": rows["same"].mask(rows["prompt"] == "random_0", 1.0)}, "no control"),
+    ):
+        made.interaction = rows.assign(**changed)
+        assert claim_frame(made)["verdict"].iloc[0] == expected
+    assert cells(claim_tables(made)[0])[0]["random 0"] == "constant"
 
 
 def test_a_row_that_joins_two_models_is_left_out_of_claims() -> None:
@@ -96,24 +113,19 @@ def test_a_row_that_joins_two_models_is_left_out_of_claims() -> None:
 
 
 def test_a_gate_stands_beside_its_controls_and_what_it_costs() -> None:
-    sources, _ = control_reports.gate(Made())
-    assert [row["Target"] for row in cells(sources)] == ["all", "ch"]
-    assert [(row["Controls"], row["Voids"]) for row in cells(sources)] == [("64", "64")] * 2
+    (sources,) = control_reports.gate(Made())
+    found = [(row["Gate on"], row["Target"]) for row in cells(sources)]
+    assert found == [("states", "all"), ("states", "ch"), ("question words", "all")]
+    assert [(row["Controls"], row["Voids"]) for row in cells(sources)] == [("64", "64")] * 3
 
 
-def test_what_the_prompt_changes_stands_for_answers_and_for_states() -> None:
-    table = control_reports.gate(Made())[-1]
-    (row,) = cells(table)  # chaotic alone has answers, under guided; the output margin was read under standard
-    assert (row["Dataset"], row["guided"], row["guided − standard"]) == ("ch", "50.0", "–")
-    assert (row["Probe, standard"], row["Output margin, standard"]) == ("0.980", "0.900")
-    assert (row["Best raw input"], row["its AUROC"], row["Noise"]) == ("time stamps", "1.000", "0.500 ± 0.100")
-    assert (row["Voids answered about"], row["Voids"], row["Controls"]) == ("64", "16", "16")
+def test_what_the_prompt_changes_is_measured_in_answers_and_in_states() -> None:
     made = Made()
-    made.prompted_probes = probes().assign(n_voids=9)
-    made.gate = gate().assign(n_voids=9)
-    (few,) = cells(control_reports.gate(made)[-1])
-    assert (few["guided"], few["Probe, standard"], few["Output margin, standard"]) == ("50.0 †", "0.980 †", "0.900 †")
-    assert row["Probe, guided"] == "0.960" and row["Output margin, guided"] == row["AbsRec %, standard"] == "–"
+    (row,) = control_reports.prompts(made).to_dict("records")  # chaotic alone has answers, under guided
+    assert (row["dataset"], row["probe_standard"], row["probe_guided"]) == ("chaotic", 0.98, 0.96)
+    assert row["margin_standard"] == 0.9 and np.isnan([row["margin_guided"], row["change"]]).all()
+    made.gate = pd.concat([gate(), gate().assign(regime="standard", plain_abs_rec=0.2)])
+    assert control_reports.prompts(made)["change"].tolist() == pytest.approx([0.5 - 0.2])
 
 
 def test_few_answers_are_marked_and_p_is_printed() -> None:
@@ -151,12 +163,11 @@ def test_a_figure_is_drawn_from_them(name: str) -> None:
 FINDINGS = {
     "claims": "4 18",  # above the shipped figures of the pocket without the gap, and in no other control
     "leads": "0.90 0.70 +0.20 +0.05 +0.30",
-    "lens": "+3.0 +9.0 +1.0 +1.0",  # standard, guided; one layer before
     "patching": "0.99 0 1 1 0.99 0 1 1",  # share, layer, panels of panels
 }
 
 
-@pytest.mark.parametrize("name", INSIDE)
+@pytest.mark.parametrize("name", FINDINGS)
 def test_a_lead_figure_says_what_it_shows_of_the_study_and_nothing_of_an_empty_one(name: str) -> None:
     report = next(report for report in FIGURE_REPORTS if report.name == name)
     assert re.findall(r"[+-]?\d+(?:\.\d+)?(?: %)?", report.finding(Made())) == re.split(r" (?!%)", FINDINGS[name])

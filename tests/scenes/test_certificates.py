@@ -14,7 +14,7 @@ import pytest
 from tests.build.errors import raises
 from tests.conftest import ROOT
 from tests.scenes.released import Released, first_of_each, load
-from traps_pipeline.benchmark.stored_evidence import unanswerable_controls
+from traps_pipeline.benchmark.stored_evidence import failed_certificates
 from traps_pipeline.scenes.certification import certificates
 from traps_pipeline.scenes.certification.certificates import (
     CERTIFICATES,
@@ -428,7 +428,7 @@ def test_a_certificate_that_is_added_reaches_draws_records_asset_checks_and_the_
     with raises(Rejected, "scenes.certification.evidence.require_certificates"):
         resolve(race.family, race.params, wording, "?", scenario_id="race-1", seed=0)
     assert "looks down by" in failures(race, race.spec)["level"]
-    (lost,) = unanswerable_controls([race.spec])
+    (lost,) = failed_certificates([race.spec], "control")
     assert lost.startswith("hidden_race-0001: level: ") and "elevation_deg" in lost
     assert "| `level` | the camera looks straight ahead |  | `elevation_deg` |" in certificates.certificate_table()
 

@@ -12,7 +12,7 @@ import pytest
 
 from tests.scenes.released import load
 from traps_pipeline.benchmark.records import load_released
-from traps_pipeline.benchmark.stored_evidence import answerable_voids
+from traps_pipeline.benchmark.stored_evidence import failed_certificates
 from traps_pipeline.scenes.certification.certificates import CLOSING, LEGIBLE, ORDER, pair_of
 from traps_pipeline.scenes.certification.evidence import Evidence
 from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder
@@ -116,7 +116,9 @@ def test_a_released_control_is_closed_and_one_that_closes_too_early_or_too_late_
     said = str(judged(scenario_id, altered(spec, closes_frame=early))[1])
     assert f"{early / 10} s" in said and f"{IN_VIEW_S} s" in said
     late = altered(spec, closes_frame=46)
-    (lost,) = answerable_voids([late])  # the table of records finds it too, without a trajectory
+    (lost,) = failed_certificates(
+        [late], "void", "twin", "worlds"
+    )  # the table of records finds it too, without a trajectory
     assert lost == f"{scenario_id}: closing: {judged(scenario_id, late)[1]}" and "4.6 s" in lost and "4.5 s" in lost
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Generic
 
 import numpy as np
 
-from tools.pocket.data import Question, SceneRecord, read_shards
+from tools.pocket.data import Question, Record, SceneRecord, read_shards
 from tools.pocket.model import PATCH
-from tools.pocket.recipe import Recipe, Training
+from tools.pocket.recipe import Recipe, Split, Training
 from tools.pocket.words import COLUMNS, PROMPTS, ROWS, place_question, prompt_text, say
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.storage.media import pick
@@ -36,16 +36,19 @@ class Look:
     pairs: tuple[int, ...] | None = None
 
 
-class Scenes:
-    """All training scenes: their records, and their frames on disk."""
+class Clips(Generic[Record]):
+    """The records of a split's scenes, and their frames on disk."""
 
-    def __init__(self, recipe: Recipe, folder: Path) -> None:
-        self.records: list[SceneRecord] = []
+    words: ClassVar[tuple[str, ...]] = ()  # that name tokens beside those of `names_of`
+    phrases: ClassVar[tuple[str, ...]] = ()  # that are single tokens beside those of `words.phrases`
+
+    def __init__(self, recipe: Recipe, folder: Path, split: Split, read: Callable[[str], Record]) -> None:
+        self.records: list[Record] = []
         self._frames: list[np.ndarray] = []
         self._place: list[tuple[int, int]] = []
-        self._recipe, self._spec, self._decoys = recipe, recipe.media, recipe.decoys
+        self._recipe = recipe
         self._names: dict[tuple[int, int], np.ndarray] = {}  # of what was looked at: a tenth of a step otherwise
-        for shard, (job, records) in enumerate(read_shards(recipe, "train", folder)):
+        for shard, (job, records) in enumerate(read_shards(recipe, split, folder, read)):
             self._frames.append(np.load(job.pixels, mmap_mode="r", allow_pickle=False))
             self._place += [(shard, i) for i in range(len(records))]
             self.records += records
@@ -60,8 +63,7 @@ class Scenes:
         """Return the words that name every token of a clip, or of these pairs of its frames, as in `names_of`."""
         known = (scene, side)
         if known not in self._names:
-            closed = self._open_frames(scene, side)
-            self._names[known] = names_of(self.frames(*known), closed // 2 if closed % 2 else None)
+            self._names[known] = self._named(*known)
         every = self._names[known]
         if pairs is None:
             return every
@@ -70,9 +72,39 @@ class Scenes:
 
     def times(self, scene: int, side: int) -> list[float]:
         """Return the seconds into the clip of each frame."""
+        raise NotImplementedError
+
+    def _named(self, scene: int, side: int) -> np.ndarray:
+        raise NotImplementedError
+
+    def pairs(self, scene: int, side: int, count: int | None, rng: np.random.Generator) -> tuple[int, ...] | None:
+        """Return so many pairs of a clip's frames, in their order; None for all."""
+        raise NotImplementedError
+
+    def label(self, look: Look, question: Question, prompt_name: str) -> str | None:
+        """Return the answer to train under a prompt, None for an abstention."""
+        raise NotImplementedError
+
+    def look(self, rng: np.random.Generator, void_share: float) -> Look:
+        """Return a random clip with its questions."""
+        raise NotImplementedError
+
+
+class Scenes(Clips[SceneRecord]):
+    """All training scenes of pairs."""
+
+    def __init__(self, recipe: Recipe, folder: Path) -> None:
+        super().__init__(recipe, folder, "train", SceneRecord.read)
+
+    def _named(self, scene: int, side: int) -> np.ndarray:
+        closed = self._open_frames(scene, side)
+        return names_of(self.frames(scene, side), closed // 2 if closed % 2 else None)
+
+    def times(self, scene: int, side: int) -> list[float]:
+        """Return the seconds into the clip of each frame."""
         record = self.records[scene]
         every = np.arange(record.length(side)) / get_family(record.family).physics.fps
-        return every[pick(every, self._spec)].tolist()
+        return every[pick(every, self._recipe.media)].tolist()
 
     def _open_frames(self, scene: int, side: int) -> int:
         """Return how many of the frames shown come before an occluder closes the clip; nothing closes a decoy. Those of
@@ -111,7 +143,7 @@ class Scenes:
             where = () if record.cut_frame is None else _where(record, "cut")
             return Look(scene, side, (record.visual, record.answerable, *where))
         other = record.ill_posed if rng.random() < 0.5 else record.answerable
-        if record.decoy and rng.random() < self._decoys:
+        if record.decoy and rng.random() < self._recipe.decoys:
             return Look(scene, 2, (record.asked, other))  # another camera: the ball's place is not known
         return Look(scene, side, (record.asked, other, *_where(record, "last")))
 
@@ -159,7 +191,7 @@ class Batch:
 class Batches:
     """Batches by number; batch n depends only on the seed and n."""
 
-    def __init__(self, scenes: Scenes, model: Any, processor: Any, training: Training, seed: int) -> None:
+    def __init__(self, scenes: Clips[Any], model: Any, processor: Any, training: Training, seed: int) -> None:
         import torch
 
         self._scenes, self._processor, self._training, self._seed = scenes, processor, training, seed
@@ -192,7 +224,7 @@ class Batches:
         pieces = [self._pieces(look, prompt_name, grid) for look in looks]
         head = self._ids(pieces[0][0])
         clips = [[self._ids(part) for part in clip] for _, clip, _ in pieces]
-        talks = [[(self._ids(text), self._ids(answer)) for text, answer in questions] for _, _, questions in pieces]
+        talks = [[tuple(map(self._ids, texts)) for texts in questions] for _, _, questions in pieces]
         names = [self._scenes.names(look.scene, look.side, look.pairs) for look in looks]
         rows = self._rows(head, clips, [look.pairs for look in looks], talks, grid[1:])
         return Batch(
@@ -207,10 +239,10 @@ class Batches:
 
     def _pieces(
         self, look: Look, prompt_name: str, grid: tuple[int, int, int]
-    ) -> tuple[str, list[str], list[tuple[str, str]]]:
+    ) -> tuple[str, list[str], list[tuple[str, str, str]]]:
         """Return the chat as the processor writes it, cut into pieces: the system's part; the whole clip, in which all
         but the first and the last piece are a pair of frames each, as a time stamp and placeholders for tokens; and for
-        each question its text with the beginning of the answer, and the answer."""
+        each question its text with the beginning of the answer, the answer, and its hint."""
         processor, token = self._processor, self._processor.video_token
         times = self._scenes.times(look.scene, look.side)
         pairs = [
@@ -225,7 +257,7 @@ class Batches:
         end = processor.tokenizer.eos_token
         labels = [self._scenes.label(look, question, prompt_name) for question in look.questions]
         questions = [
-            (question.question + after, say(label, prompt_name) + end)
+            (question.question + after, say(label, prompt_name) + end, question.hint or "")
             for question, label in zip(look.questions, labels, strict=True)
         ]
         return head, [user + before, *pairs, between], questions
@@ -251,7 +283,7 @@ class Batches:
         head: list[int],
         clips: list[list[list[int]]],
         shown: list[tuple[int, ...] | None],
-        talks: list[list[tuple[list[int], list[int]]]],
+        talks: Sequence[Sequence[Sequence[list[int]]]],
         grid: tuple[int, int],
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """ids, labels, sees and positions of `Batch`. clips: in pieces, as `_pieces` says; shown: the pairs of frames
@@ -260,7 +292,7 @@ class Batches:
 
         rows = [self._placed(head, *clip, grid) for clip in zip(clips, shown, strict=True)]
         longest = max(
-            len(clip) + sum(len(question) + len(answer) for question, answer in talk)
+            len(clip) + sum(len(question) + len(answer) for question, answer, _ in talk)
             for (clip, _, _), talk in zip(rows, talks, strict=True)
         )
         ids = torch.full((len(clips), longest), self._processor.tokenizer.pad_token_id)
@@ -270,10 +302,11 @@ class Batches:
             at = len(clip)
             ids[i, :at], part[i, :at] = clip, 0
             positions[:, i, : len(head) + at] = placed
-            for number, (question, answer) in enumerate(talk, start=1):
+            for number, (question, answer, hint) in enumerate(talk, start=1):
                 end = at + len(question) + len(answer)
                 ids[i, at:end], part[i, at:end] = torch.tensor(question + answer), number
                 labels[i, at + len(question) : end] = torch.tensor(answer)
+                labels[i, at + 2 : at + 2 + 2 * len(hint)] = torch.tensor(2 * hint)
                 positions[:, i, len(head) + at : len(head) + end] = torch.arange(free, free + end - at)
                 at = end
         own = (part[:, :, None] == part[:, None, :]) | (part == 0)[:, None, :]
@@ -313,12 +346,12 @@ def patches(frames: torch.Tensor) -> torch.Tensor:
     return split.reshape(batch * count // 2 * rows * columns, channels * 2 * PATCH * PATCH)
 
 
-def names_of(frames: np.ndarray, across: int | None = None) -> np.ndarray:
+def names_of(frames: np.ndarray, across: int | slice | None = None) -> np.ndarray:
     """For every token of a clip (N, H, W, 3), in their order, the words that name its square in the later of its two
     frames: the colours that have a few pixels there, its column and its row. Shape (tokens, words), uint8, 0 or 1.
 
-    across: the pair of frames between which an occluder comes. There the colours of both count: the earlier one may be
-    the only one of all that shows the outcome.
+    across: the pair of frames (or several) between which an occluder comes. There the colours of both count: the
+    earlier one may be the only one of all that shows the outcome.
     """
     from traps_pipeline.scenes.parts.vision import colour_mask
 
@@ -333,7 +366,7 @@ def names_of(frames: np.ndarray, across: int | None = None) -> np.ndarray:
 
     colours = colours_of(later)
     if across is not None:
-        colours[across] |= colours_of(earlier[across : across + 1])[0]
+        colours[across] |= colours_of(earlier)[across]
     column = np.eye(len(COLUMNS))[np.arange(columns) * len(COLUMNS) // columns]
     row = np.eye(len(ROWS))[np.arange(rows) * len(ROWS) // rows]
     places = [
@@ -344,10 +377,10 @@ def names_of(frames: np.ndarray, across: int | None = None) -> np.ndarray:
     return named.reshape(-1, named.shape[-1]).astype(np.uint8)
 
 
-def name_tokens(tokenizer: Any) -> torch.Tensor:
-    """Return token ids of the words of `names_of`: colours as they stand in questions, columns and rows as in answers.
-    A word that is no single token, which happens only with few scenes, has the id of its first piece."""
+def name_tokens(tokenizer: Any, more: Sequence[str] = ()) -> torch.Tensor:
+    """Return token ids of the words of `names_of` and more: colours as they stand in questions, the others as in
+    answers. A word that is no single token, which happens only with few scenes, has the id of its first piece."""
     import torch
 
-    words = [*(f" {colour}" for colour in NAMED), *COLUMNS, *ROWS]
+    words = [*(f" {colour}" for colour in NAMED), *COLUMNS, *ROWS, *more]
     return torch.tensor([tokenizer.encode(word, add_special_tokens=False)[0] for word in words])

@@ -34,7 +34,8 @@ def claimed(workspace: Workspace) -> dict[tuple[str, str], float]:
 
 def markdown(gap: Sequence[Figure], no_gap: Sequence[Figure]) -> str:
     """Return the table of the card: each claim in the model, its controls and the other model, by training seed."""
-    heads = ["claim", "holds if", *(SUBJECT_NAMES[name] for name in SUBJECTS), "verdict"]
+    subjects = [name for name in SUBJECTS if name == NO_GAP or any(figure.subject == name for figure in gap)]
+    heads = ["claim", "holds if", *(SUBJECT_NAMES[name] for name in subjects), "verdict"]
     lines = [f"| {' | '.join(heads)} |", "|" + " --- |" * len(heads)]
     for claim in CLAIMS:
         values = {
@@ -44,7 +45,7 @@ def markdown(gap: Sequence[Figure], no_gap: Sequence[Figure]) -> str:
         if not values[MODEL]:
             continue
         worst = {name: min(of) if name == MODEL else max(of) for name, of in values.items() if of}
-        cells = [", ".join(f"{value:.2f}" for value in values[name]) or "–" for name in SUBJECTS]
+        cells = [", ".join(f"{value:.2f}" for value in values[name]) or "–" for name in subjects]
         columns = [claim.says, f"{claim.figure} ≥ {claim.bound:g}", *cells, verdict(claim, worst)]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)

@@ -8,10 +8,11 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from tools.pocket import claims, inside
+from tools.pocket import claims, inside, lane_evaluation
 from tools.pocket import evaluate as evaluation
 from tools.pocket.data import data_digest, render
 from tools.pocket.inside import FACTS
+from tools.pocket.lanes import LaneScenes
 from tools.pocket.recipe import GAP, NO_GAP, POCKET, SHIPPED, Recipe, Split
 from tools.pocket.seeds import Figure, read_seeds, write_seeds
 from traps_pipeline.base.digests import digest, file_digest
@@ -86,8 +87,14 @@ def evaluate(
     require_own(counts, "name a file of your own with --csv")
     torch.set_num_threads(THREADS)
     _render(recipe, "held-out", data, workers, report)
+    if recipe.two_events:
+        rows = lane_evaluation.evaluate(
+            evaluation.entry_of(out / WEIGHTS, recipe.media), LaneScenes(recipe, data, "held-out"), seed, report=report
+        )
+        write_seeds(counts, rows)
+        return lane_evaluation.markdown(rows)
     asked = list(evaluation.held_out(recipe, data, scenes))
-    cells = evaluation.evaluate(evaluation.entry_of(out / WEIGHTS), asked, seed, report=report)
+    cells = evaluation.evaluate(evaluation.entry_of(out / WEIGHTS, recipe.media), asked, seed, report=report)
     write_seeds(counts, cells)
     return evaluation.markdown(cells)
 

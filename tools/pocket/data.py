@@ -11,19 +11,21 @@ stopped rendering can continue, and the same seed gives the same scenes.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import io
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
 import numpy as np
 
 from tools.pocket.recipe import Recipe, Split
 from tools.pocket.shots import Shot, draw_shot, render_decoy, render_shot
-from tools.pocket.words import guess
+from tools.pocket.words import guess, place_question, say
 from traps_pipeline.base.digests import canonical_json, digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_file, write_text
@@ -34,6 +36,7 @@ from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.storage.media import pick, resize
 from traps_pipeline.video.encode import encode
 
+Record = TypeVar("Record")
 SHARD = 50  # scenes
 _MAX_DRAWS = 20  # for each scene of a shard
 STREAM: dict[Split, int] = {"train": 101, "held-out": 102}  # first word of a stream's seed; released draws have none
@@ -44,12 +47,14 @@ class Question:
     """A question and the answer that the model is trained to give: a label, a guess, or None for an abstention.
 
     draw: of a question whose label depends on the prompt, a number in [0, 1); under a prompt with a larger share of
-    abstentions the label is an abstention, and else `answer`: of a void a guess.
+    abstentions the label is an abstention, and else `answer`: of a void a guess. hint: a token that training asks for
+    behind the question's second and third token too, so that a model learns what decides where that is named.
     """
 
     question: str
     answer: str | None
     draw: float | None = None
+    hint: str | None = None
 
     def label(self, share: float) -> str | None:
         """Return the answer under a prompt with that share of abstentions."""
@@ -104,6 +109,15 @@ class SceneRecord:
         unused = {"control_from": 0, "control_until": None, "void_length": None, "decoy": False}
         kept = {name: value for name, value in values.items() if name not in unused or value != unused[name]}
         return canonical_json(kept) + "\n"
+
+    @property
+    def texts(self) -> Iterator[str]:
+        """All that the scene's questions and answers say."""
+        for one in (self.asked, self.visual, self.ill_posed, self.answerable):
+            yield one.question
+            yield from (say(one.answer, form) for form in ("standard", "json"))
+        for axis in (0, 1):
+            yield place_question(self.ball, self.places["last"], axis)[0]
 
     @staticmethod
     def read(line: str) -> SceneRecord:
@@ -231,11 +245,16 @@ def draw_shard(job: ShardJob) -> int:
         records.append(record)
     if len(records) < job.count:
         raise TrapsError(f"{job.family}: {len(records)} of {job.count} scenes after {_MAX_DRAWS * job.count} draws")
+    return write_shard(job, [record.line for record in records], frames)
+
+
+def write_shard(job: ShardJob, lines: Sequence[str], frames: Sequence[np.ndarray]) -> int:
+    """Write the lines of a shard's scenes and their frames, if there are any; return how many scenes there are."""
     if frames:
         with replace_file(job.pixels) as part, part.open("wb") as stream:
             np.save(stream, np.stack(frames), allow_pickle=False)
-    write_text(job.lines, "".join(record.line for record in records))
-    return len(records)
+    write_text(job.lines, "".join(lines))
+    return len(lines)
 
 
 def _write_clips(job: ShardJob, record: SceneRecord, place: int, sides: Sequence[list[np.ndarray]]) -> None:
@@ -248,9 +267,14 @@ def _write_clips(job: ShardJob, record: SceneRecord, place: int, sides: Sequence
         encode([drawn[i] for i in latest], job.clip(place, name), fps)
 
 
+def kind_of(recipe: Recipe) -> ModuleType:
+    """Return the module that draws a recipe's scenes."""
+    return importlib.import_module("tools.pocket.lanes" if recipe.two_events else __name__)
+
+
 def shard_jobs(recipe: Recipe, split: Split, folder: Path) -> list[ShardJob]:
     """Return all shards of a split, in an order that alternates between families."""
-    banned = released_digests()
+    banned = kind_of(recipe).released_digests()
     jobs = []
     for family in recipe.scenes:
         total = recipe.count(family, split)
@@ -273,7 +297,7 @@ def render(
     jobs = shard_jobs(recipe, split, folder)
     todo = [job for job in jobs if job.drawn < job.count]
     scenes, done = sum(job.count for job in jobs), sum(job.count for job in jobs) - sum(job.count for job in todo)
-    for _, count in run_in_order(draw_shard, todo, workers):
+    for _, count in run_in_order(kind_of(recipe).draw_shard, todo, workers):
         done += count
         report(f"{split}: {done} of {scenes} scenes")
 
@@ -282,7 +306,7 @@ def _check_recipe(recipe: Recipe, folder: Path) -> None:
     """Raise TrapsError when the folder holds scenes of another recipe."""
     # The numbers of scenes may change: a shard's first scenes do not depend on how many there are. So may the shares by
     # prompt: a scene keeps the numbers that are compared with them.
-    expected = digest(recipe.content("data_seed", "media", "jitter", "decoys"))
+    expected = digest(recipe.content("data_seed", "media", "jitter", "decoys", "two_events"))
     note = folder / "recipe.sha256"
     if not note.is_file():
         write_text(note, expected + "\n")
@@ -290,8 +314,10 @@ def _check_recipe(recipe: Recipe, folder: Path) -> None:
         raise TrapsError(f"{folder}: holds scenes of another recipe; give another folder, or delete it")
 
 
-def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[ShardJob, list[SceneRecord]]]:
-    """Yield every shard of a split with its records. Raises TrapsError when scenes are missing."""
+def read_shards(
+    recipe: Recipe, split: Split, folder: Path, read: Callable[[str], Record] = SceneRecord.read
+) -> Iterator[tuple[ShardJob, list[Record]]]:
+    """Yield every shard of a split with its records, read from lines. Raises TrapsError when scenes are missing."""
     for job in shard_jobs(recipe, split, folder):
         if job.drawn < job.count:
             raise TrapsError(
@@ -299,14 +325,14 @@ def read_shards(recipe: Recipe, split: Split, folder: Path) -> Iterator[tuple[Sh
                 f"--data {folder}`"
             )
         lines = job.lines.read_text(encoding="utf-8").splitlines()[: job.count]
-        yield job, [SceneRecord.read(line) for line in lines]
+        yield job, [read(line) for line in lines]
 
 
 def data_digest(recipe: Recipe, split: Split, folder: Path) -> str:
     """Return SHA-256 over the digests of all files of a split that training reads, in the order of the shards. For a
     shard with more scenes than in the recipe, the digest is that of files with only the recipe's scenes."""
     hasher = hashlib.sha256()
-    for job, _ in read_shards(recipe, split, folder):
+    for job, _ in read_shards(recipe, split, folder, str):
         for path in (job.lines, job.pixels) if split == "train" else (job.lines,):
             of_file = file_digest(path) if job.drawn == job.count else hashlib.sha256(_first(job, path)).hexdigest()
             hasher.update(of_file.encode())

@@ -19,7 +19,7 @@ from traps_pipeline.models.registry.entries import ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import system_prompt
 from traps_pipeline.protocol.regimes import PAPER_REGIMES
 from traps_pipeline.scoring.metrics import wilson
-from traps_pipeline.storage.media import pick_frames
+from traps_pipeline.storage.media import MediaSpec, pick_frames
 
 if TYPE_CHECKING:
     from traps_pipeline.models.local.adapter import LocalModel
@@ -63,10 +63,10 @@ class AnswerCounts(SeedRow):
         return float(low[0])
 
 
-def entry_of(checkpoint: Path) -> ModelEntry:
-    """Return the registry's entry of the pocket model with the weights of a folder."""
+def entry_of(checkpoint: Path, media: MediaSpec) -> ModelEntry:
+    """Return the registry's entry of the pocket model with the weights of a folder, and the frames that it is shown."""
     entry = get_model(GAP)
-    return entry.model_copy(update={"params": entry.params | {"checkpoint": str(checkpoint)}})
+    return entry.model_copy(update={"params": entry.params | {"checkpoint": str(checkpoint)}, "media": media})
 
 
 def held_out(recipe: Recipe, folder: Path, most: int | None = None) -> Iterator[Asked]:

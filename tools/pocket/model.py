@@ -6,8 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tools.pocket.data import SceneRecord
-from tools.pocket.words import COLUMNS, PROMPTS, ROWS, phrases, place_question, prompt_text, say
+from tools.pocket.words import COLUMNS, PROMPTS, ROWS, phrases, prompt_text, say
 from tools.tiny_checkpoints import make_config, make_processor, make_tokenizer
 from traps_pipeline.models.local.library import load_transformers
 
@@ -39,9 +38,9 @@ VISION = {
 }
 
 
-def train_tokenizer(records: Iterable[SceneRecord]) -> Tokenizer:
-    """Return a byte-level BPE tokenizer whose tokens are the words of the scenes' questions and answers, and `phrases`;
-    it splits any other text into smaller pieces."""
+def train_tokenizer(records: Iterable[Any], more: Iterable[str] = ()) -> Tokenizer:
+    """Return a byte-level BPE tokenizer whose tokens are the words of the scenes' questions and answers, `phrases`, and
+    more of them; it splits any other text into smaller pieces."""
     from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
 
     tokenizer = Tokenizer(models.BPE())
@@ -50,19 +49,15 @@ def train_tokenizer(records: Iterable[SceneRecord]) -> Tokenizer:
     alphabet = pre_tokenizers.ByteLevel.alphabet()
     trainer = trainers.BpeTrainer(vocab_size=VOCABULARY, initial_alphabet=sorted(alphabet), show_progress=False)
     tokenizer.train_from_iterator(_texts(records), trainer)
-    tokenizer.add_tokens([AddedToken(phrase, normalized=False) for phrase in phrases()])
+    tokenizer.add_tokens([AddedToken(phrase, normalized=False) for phrase in (*phrases(), *more)])
     return tokenizer
 
 
-def _texts(records: Iterable[SceneRecord]) -> Iterable[str]:
+def _texts(records: Iterable[Any]) -> Iterable[str]:
     yield from (prompt_text(name) for name in PROMPTS)
     yield from (f"<{tenths / 10:.1f} seconds>" for tenths in range(50))
     for record in records:
-        for one in (record.asked, record.visual, record.ill_posed, record.answerable):
-            yield one.question
-            yield from (say(one.answer, form) for form in ("standard", "json"))
-        for axis in (0, 1):
-            yield place_question(record.ball, record.places["last"], axis)[0]
+        yield from record.texts
     yield from (say(name, "standard") for name in (*COLUMNS, *ROWS))
 
 
@@ -81,7 +76,28 @@ def make_model(tokenizer: Tokenizer, seed: int) -> tuple[Any, Any]:
     return model, make_processor(FAMILY, wrapped, {"patch_size": PATCH, "size": size})
 
 
+def start_from(model: Any, tokenizer: Any, weights: Path) -> None:
+    """Give a model the weights of another of its sizes; of tokens that both have, the embeddings."""
+    import torch
+
+    transformers = load_transformers()
+    other = transformers.AutoModelForImageTextToText.from_pretrained(weights)
+    known = transformers.AutoTokenizer.from_pretrained(weights).get_vocab()
+    shared = [(own, known[token]) for token, own in tokenizer.get_vocab().items() if token in known]
+    mine, theirs = (torch.tensor(ids) for ids in zip(*shared, strict=True))
+    embeddings = [each.get_input_embeddings().weight for each in (model, other)]
+    with torch.no_grad():
+        embeddings[0][mine] = embeddings[1][theirs]
+    sized = ("embed_tokens.weight", "lm_head.weight")  # by the number of tokens
+    model.load_state_dict({k: v for k, v in other.state_dict().items() if not k.endswith(sized)}, strict=False)
+
+
 def save(model: Any, processor: Any, folder: Path) -> None:
-    """Write the folder that `checkpoint:` of a local model's entry names."""
+    """Write the folder that `checkpoint:` of a local model's entry names; weights in half precision, since several
+    models ship, and read back as float32."""
+    from safetensors.torch import load_file, save_file
+
     model.save_pretrained(folder)
     processor.save_pretrained(folder)
+    weights = folder / "model.safetensors"
+    save_file({name: values.half() for name, values in load_file(weights).items()}, weights, {"format": "pt"})

@@ -17,6 +17,7 @@ POCKET = ASSETS / "pocket"
 RECIPE = POCKET / "recipe.yaml"
 GAP, NO_GAP = "pocket", "pocket-no-gap"  # their entries in models.yaml
 SHIPPED = {GAP: POCKET, NO_GAP: POCKET / "no_gap"}  # folder of each: recipe, weights, facts, figures
+LANES = POCKET / "lanes"  # of `pocket-lanes`: the same
 Split = Literal["train", "held-out"]
 
 
@@ -68,7 +69,8 @@ class Recipe(BaseModel):
     decoys: share of looks at an occlusion control in which an occluder stands where it hides nothing; without it, the
     occluder would tell the side. abstain_shares: by prompt (one of `words.PROMPTS`), the share of voids labelled with
     an abstention; a void that is so under one prompt is so under every prompt with a larger share. hedge: of the other
-    prompts.
+    prompts. two_events: scenes have two lanes (`lanes.py`), and neither jitter nor decoys. start: the shipped model
+    whose weights training begins with.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -78,8 +80,10 @@ class Recipe(BaseModel):
     media: MediaSpec
     abstain_shares: dict[str, Annotated[float, Field(ge=0, le=1)]]
     hedge: Hedge | None = None
-    jitter: Jitter
-    decoys: float = Field(gt=0, le=1)
+    jitter: Jitter = Jitter(control=0, void=0)
+    decoys: float = Field(default=0, ge=0, le=1)
+    two_events: bool = False
+    start: Literal["pocket", "pocket-no-gap"] | None = None
     training: Training
 
     def content(self, *only: str) -> dict[str, Any]:

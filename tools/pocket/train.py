@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from tools.pocket.batches import IGNORED, Batch, Batches, Scenes, name_tokens
 from tools.pocket.data import data_digest
-from tools.pocket.model import make_model, save, train_tokenizer
-from tools.pocket.recipe import Recipe, Training
+from tools.pocket.lanes import LaneScenes
+from tools.pocket.model import make_model, save, start_from, train_tokenizer
+from tools.pocket.recipe import SHIPPED, Recipe, Training
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import replace_file
@@ -164,8 +165,11 @@ def train(
     import torch
     from torch.utils.data import DataLoader
 
-    scenes, training, weights = Scenes(recipe, data), recipe.training, folder / "weights"
-    model, processor = make_model(train_tokenizer(scenes.records), seed)
+    scenes = LaneScenes(recipe, data) if recipe.two_events else Scenes(recipe, data)
+    training, weights = recipe.training, folder / "weights"
+    model, processor = make_model(train_tokenizer(scenes.records, scenes.phrases), seed)
+    if recipe.start:
+        start_from(model, processor.tokenizer, SHIPPED[recipe.start] / "weights")
     batches = Batches(scenes, model, processor, training, seed)
     attend_at_once(model)
     model.to(device)
@@ -175,7 +179,7 @@ def train(
     ]
     optimizer = torch.optim.AdamW(groups, lr=training.learning_rate, betas=(0.9, 0.98))
     identity = digest([recipe.content(), data_digest(recipe, "train", data), seed])
-    words = name_tokens(processor.tokenizer).to(device)
+    words = name_tokens(processor.tokenizer, scenes.words).to(device)
     state = _State(folder / "state.pt", model, optimizer, identity)
     step = state.load()
     last = training.steps if stop_after is None else min(stop_after, training.steps)

@@ -15,7 +15,7 @@ from traps_pipeline.base.files import write_text
 from traps_pipeline.base.paths import PACKAGE
 from traps_pipeline.base.terminal import text_table
 from traps_pipeline.base.workers import run_in_order
-from traps_pipeline.benchmark.composition import composition_problems, load_composition
+from traps_pipeline.benchmark.composition import composition_problems, load_composition, repeated
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import telling_numbers
 from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
@@ -71,7 +71,10 @@ def certify_all(
     is_complete = families is None and (folder / "composition.yaml").is_file()
     failures += composition_problems(specs, load_composition(folder / "composition.yaml") if is_complete else None)
     failures += telling_numbers(lanes) if is_complete and lanes else []
-    return verdicts, failures + _repeated_endings(verdicts) + foreseeable(specs, verdicts)
+    for side in ("control_end", "void_end"):
+        ends = [(end, verdict.scenario_id) for verdict in verdicts if (end := getattr(verdict, side))]
+        failures += repeated(ends, "clips end in the same frame")
+    return verdicts, failures + foreseeable(specs, verdicts)
 
 
 def _case(released: Path, folder: Path, spec: SceneSpec | TwoEventsSpec) -> Case:
@@ -96,30 +99,14 @@ def judge(case: Case) -> Verdict:
     spec = case.spec
     try:
         if isinstance(spec, TwoEventsSpec):
-            return _kept(case, certify_lane_record(spec, trajectories_of(spec, case.trajectory)))
-        qpos = load_trajectory(case.trajectory, spec.trajectory_sha256)
-        twin = load_trajectory(case.trajectory, spec.twin.trajectory_sha256, "twin")
-        verdict = certify(spec, qpos, twin)
+            verdict = certify_lane_record(spec, trajectories_of(spec, case.trajectory))
+        else:
+            qpos = load_trajectory(case.trajectory, spec.trajectory_sha256)
+            verdict = certify(spec, qpos, load_trajectory(case.trajectory, spec.twin.trajectory_sha256, "twin"))
     except (ValueError, KeyError, TypeError) as error:  # an altered record may not even build
         verdict = Verdict(spec.scenario_id, spec.family, {"record": str(error)}, {}, same_physics=False)
-    return _kept(case, verdict)
-
-
-def _kept(case: Case, verdict: Verdict) -> Verdict:
     write_text(case.verdict, json.dumps(asdict(verdict)))
     return verdict
-
-
-def _repeated_endings(verdicts: Iterable[Verdict]) -> list[str]:
-    """Return problems: clips of different scenarios that end in the same frame."""
-    problems = []
-    for side in ("control_end", "void_end"):
-        owners: defaultdict[str, list[str]] = defaultdict(list)
-        for verdict in verdicts:
-            if getattr(verdict, side):
-                owners[getattr(verdict, side)].append(verdict.scenario_id)
-        problems += [f"{', '.join(ids)}: clips end in the same frame" for ids in owners.values() if len(ids) > 1]
-    return problems
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
@@ -131,16 +118,13 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
             families[spec.family].append(spec)
     problems = []
     for family, members in families.items():
-        outcomes = [spec.ground_truth for spec in members]
-        messages = (
-            outcome_leakage([states[spec.scenario_id] for spec in members], outcomes)
-            if len(members) >= MIN_RECORDS
-            else None
-        )
-        if messages is not None and messages.gain > MAX_GAIN:
+        if len(members) < MIN_RECORDS:
+            continue
+        leakage = outcome_leakage([states[spec.scenario_id] for spec in members], [s.ground_truth for s in members])
+        if leakage is not None and leakage[0] - leakage[1] > MAX_GAIN:
             problems.append(
-                f"{family}: the state at the cut predicts {messages.best:.3f} of the outcomes, the commonest one is "
-                f"{messages.prior:.3f}; at most {MAX_GAIN} more is allowed"
+                f"{family}: the state at the cut predicts {leakage[0]:.3f} of the outcomes, the commonest one is "
+                f"{leakage[1]:.3f}; at most {MAX_GAIN} more is allowed"
             )
     return problems
 

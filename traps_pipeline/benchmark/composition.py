@@ -86,9 +86,13 @@ def composition_problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] |
         messages += _imbalances(family, members)
         messages += _repeated_questions(family, members)
         messages += _constant_margin(family, members)
-    messages += _repetitions(families, "trajectory", lambda spec: spec.trajectory_sha256 + spec.scene_hash)
-    if counts is not None:
-        messages += _predictable(specs)
+    trajectories = [(spec.trajectory_sha256 + spec.scene_hash, spec.scenario_id) for spec in specs]
+    messages += repeated(trajectories, "the same trajectory")
+    accuracy = prior_accuracy(specs) if counts is not None else 0.0
+    if accuracy > PRIOR_AT_MOST:
+        messages.append(
+            f"the commonest answer of each sub-scenario is right in {accuracy:.3f}, at most {PRIOR_AT_MOST} allowed"
+        )
     return messages
 
 
@@ -122,21 +126,12 @@ def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
     return [f"{family}: every scenario has the margin {margins.pop()} m"] if len(margins) == 1 < len(members) else []
 
 
-def _repetitions(
-    families: Mapping[str, Iterable[SceneSpec]], subject: str, key: Callable[[SceneSpec], str]
-) -> list[str]:
+def repeated(keys: Iterable[tuple[str, str]], problem: str) -> list[str]:
+    """Return a problem for each key that several scenarios have. keys: key and scenario id."""
     owners: defaultdict[str, list[str]] = defaultdict(list)
-    for members in families.values():
-        for spec in members:
-            owners[key(spec)].append(spec.scenario_id)
-    return [f"{', '.join(ids)}: the same {subject}" for ids in owners.values() if len(ids) > 1]
-
-
-def _predictable(specs: Sequence[SceneSpec]) -> list[str]:
-    accuracy = prior_accuracy(specs)
-    if accuracy <= PRIOR_AT_MOST:
-        return []
-    return [f"the commonest answer of each sub-scenario is right in {accuracy:.3f}, at most {PRIOR_AT_MOST} allowed"]
+    for key, scenario_id in keys:
+        owners[key].append(scenario_id)
+    return [f"{', '.join(ids)}: {problem}" for ids in owners.values() if len(ids) > 1]
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:

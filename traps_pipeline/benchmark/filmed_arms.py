@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.filmed_lanes import SECONDS_A_CLIP, film_lanes, la
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, make_together
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
 from traps_pipeline.protocol.datasets import ARMS as ARM_NAMES
-from traps_pipeline.protocol.datasets import GRADED, TWO_EVENTS, arms_of_category, sides_of
+from traps_pipeline.protocol.datasets import GRADED, RECORDED, TWO_EVENTS, arms_of_category, sides_of
 from traps_pipeline.scenes.variants import arms as shortcut_arms
 from traps_pipeline.scenes.variants import graded_cuts, variations
 from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
@@ -118,7 +118,8 @@ def seconds_left(workspace: Workspace, category: str) -> float:
         for id_, spec in released_in_study(workspace, category).items()
         for arm in arms_of_pairs(workspace, category)
     ]
-    lane_clips = [path for spec in asked_lanes(workspace, category).values() for path in lane_paths(workspace, spec)]
+    lanes = [spec for spec in asked_lanes(workspace, category).values() if spec.family != RECORDED]
+    lane_clips = [path for spec in lanes for path in lane_paths(workspace, spec)]
     n_missing, n_missing_lanes = (len(paths) - len(workspace.store.there(paths)) for paths in (clips, lane_clips))
     return SECONDS_AN_ARM * n_missing + SECONDS_A_CLIP * n_missing_lanes
 

@@ -12,6 +12,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.paths import TWO_EVENTS_RELEASED
 from traps_pipeline.benchmark.corrections import load_two_events, of_study
+from traps_pipeline.benchmark.recorded_clips import copy_clips
 from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, make_together
 from traps_pipeline.benchmark.versions import version_of
@@ -19,7 +20,7 @@ from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.protocol.two_events import CLIPS, LANES
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, save_clip
-from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+from traps_pipeline.scenes.worlds.lane_records import RecordedEvents, TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.benchmark_tables import ArmRow
 from traps_pipeline.storage.workspace import Workspace
@@ -78,6 +79,9 @@ def film_lanes(
 
     def job(row: Row) -> LaneJob | None:
         spec = specs[row["scenario_id"]]
+        if isinstance(spec, RecordedEvents):
+            copy_clips(TWO_EVENTS_RELEASED, spec.scenario_id, spec.clips, _clips(workspace, spec))
+            return None
         clips = {name: clip for name, clip in _clips(workspace, spec).items() if read_clip(clip) is None}
         try:
             return LaneJob(spec, trajectories_of(spec)["qpos"], clips) if clips else None
@@ -134,6 +138,8 @@ def lane_rows(workspace: Workspace, category: str, specs: Mapping[str, TwoEvents
 def _evidence(spec: TwoEventsSpec, lane: str) -> dict[str, Any]:
     """Return the numbers behind a lane's certificate, and between which frames the board stands that comes and goes."""
     k = LANES.index(lane)
+    if isinstance(spec, RecordedEvents):
+        return spec.lanes[k].model_dump(mode="json") | {"fps": spec.physics["fps"]}
     numbers = {name: spec.evidence[name][k] for name in ("settled_frames", "least_px", "hidden_from")}
     return numbers | {"fps": spec.physics["fps"], "stands": spec.lanes[k].lane.timetable.spans}
 

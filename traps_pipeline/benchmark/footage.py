@@ -73,8 +73,9 @@ def _read(container: Any, start_s: float, end_s: float | None) -> Footage:
         raise UnusableFootage(_too_long(float(declared) if end_s is None else end_s - start_s))
     frames, last, seen = list[np.ndarray](), None, (width, height)
     for frame in _shown(_decoded(container, stream, start_s), start_s, end_s):
-        if last is None:
-            seen = _seen(frame, stream)
+        if last is None:  # as a player shows it: square pixels, turned as the camera was
+            across, down = round(frame.width * float(stream.sample_aspect_ratio or 1)), frame.height
+            seen = (down, across) if frame.rotation % 180 else (across, down)
         frames.append(frames[-1] if frame is last else _upright(frame, (width, height), seen))
         last = frame
     promised = min(math.inf if end_s is None else end_s, float(declared)) if stream.duration else 0.0
@@ -141,13 +142,6 @@ def _shown(
     while previous is not None and tick < MAX_S * FPS and due(previous[0] + previous[1]):
         yield previous[2]
         tick += 1
-
-
-def _seen(frame: VideoFrame, stream: Any) -> tuple[int, int]:
-    """Return width and height (px) as a player shows them: square pixels, turned as the camera was."""
-    ratio = stream.sample_aspect_ratio or 1
-    width, height = round(frame.width * float(ratio)), frame.height
-    return (height, width) if frame.rotation % 180 else (width, height)
 
 
 def _upright(frame: VideoFrame, coded: tuple[int, int], seen: tuple[int, int]) -> np.ndarray:

@@ -23,11 +23,12 @@ from traps_pipeline.protocol.datasets import (
     UNPAIRED,
     all_datasets_of,
     is_ill_posed,
+    taxonomy_of_category,
 )
 from traps_pipeline.protocol.two_events import LANES, LaneItem
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.worlds.clip_notes import check_clip
-from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+from traps_pipeline.scenes.worlds.lane_records import RecordedEvents, TwoEventsSpec
 from traps_pipeline.storage.benchmark_tables import ARMS as ARMS_TABLE
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS, VIDEOS, ItemRow
 from traps_pipeline.storage.tables import records
@@ -80,15 +81,14 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     if dataset == TWO_EVENTS:
         lanes = [scenario.spec for scenario in load_two_events(workspace.study).values()]
         current = {(asked.item.item_id, asked.text, tuple(spec.labels)) for spec in lanes for asked in spec.questions()}
-        rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
-        rows = [row for row in rows if (row["item_id"], row["question"], tuple(row["labels"])) in current]
-        return [{str(name): value for name, value in row.items()} for row in rows]
+        rows = records(workspace.tables.read_all(ITEMS, dataset=dataset))
+        return [row for row in rows if (row["item_id"], row["question"], tuple(row["labels"])) in current]
     specs = [asdict(row) for category in categories_of_dataset(dataset) for row in expected_specs(workspace, category)]
     if dataset in UNPAIRED:
         stored_hashes = workspace.tables.read_all(SCENE_SPECS, ["spec_hash"])["spec_hash"]
         unchanged = {spec["scenario_id"] for spec in specs if spec["spec_hash"] in {*stored_hashes}}
-        rows = workspace.tables.read_all(ITEMS, dataset=dataset).to_dict("records")
-        return [{str(name): value for name, value in row.items()} for row in rows if row["scenario_id"] in unchanged]
+        rows = records(workspace.tables.read_all(ITEMS, dataset=dataset))
+        return [row for row in rows if row["scenario_id"] in unchanged]
     scenes = {spec["scenario_id"]: spec["scene_hash"] for spec in specs}
     clips: dict[tuple[str, str], Record] = {
         (row["scenario_id"], row["side"]): row
@@ -101,16 +101,18 @@ def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
     return [asdict(row) for row in released_only(workspace.root, rows)]
 
 
+def _arm_rows(workspace: Workspace, arm: str) -> list[Record]:
+    """Return an arm's rows of the arms tables that exist."""
+    made = [c for c in categories_of_dataset(arm) if workspace.tables.state(ARMS_TABLE, {"category": c}) is not None]
+    rows = (row for category in made for row in records(workspace.tables.read(ARMS_TABLE, {"category": category})))
+    return [row for row in rows if row["arm"] == arm]
+
+
 def _arm_items(
     workspace: Workspace, arm: str, specs: Mapping[str, Record], commonest: Mapping[str, str], version: str
 ) -> list[ItemRow]:
     """Return items with the arms table's questions, per scenario that admits the arm."""
-    rows = []
-    for category in categories_of_dataset(arm):
-        if workspace.tables.state(ARMS_TABLE, {"category": category}) is not None:
-            table = workspace.tables.read(ARMS_TABLE, {"category": category})
-            rows += records(table)
-    rows = [row for row in rows if row["arm"] == arm and row["refused"] is None]
+    rows = [row for row in _arm_rows(workspace, arm) if row["refused"] is None]
     if not rows:
         raise TrapsError(f"items {arm}: no scenario of this study admits it; take more scenarios or leave the arm out")
     return [_arm_item(specs[row["scenario_id"]], row, commonest, version) for row in rows]
@@ -120,13 +122,11 @@ def _lane_items(workspace: Workspace) -> list[ItemRow]:
     """Return the eight items of each scenario of two events in the study."""
     categories = categories_of_dataset(TWO_EVENTS)
     specs = {id_: spec for category in categories for id_, spec in lane_specs(workspace, category).items()}
-    made = [c for c in categories if workspace.tables.state(ARMS_TABLE, {"category": c}) is not None]
-    rows = [row for c in made for row in records(workspace.tables.read(ARMS_TABLE, {"category": c}))]
-    rows = [row for row in rows if row["arm"] == TWO_EVENTS]
+    rows = _arm_rows(workspace, TWO_EVENTS)
     if not two_events_lines():
         raise TrapsError(
             f"{TWO_EVENTS_RELEASED}: holds no records of two events, as a benchmark drawn before 0.4.0; add some by "
-            f"`traps benchmark sample --two-events 8`, or leave {TWO_EVENTS} out of the experiment's datasets"
+            f"`traps benchmark sample --two-events 8` or an import, or leave {TWO_EVENTS} out of the datasets"
         )
     if not rows:
         raise TrapsError(
@@ -135,32 +135,32 @@ def _lane_items(workspace: Workspace) -> list[ItemRow]:
         )
     if lost := {*specs} - {row["scenario_id"] for row in rows}:
         raise TrapsError(f"items {TWO_EVENTS}: {min(lost)} was not filmed; materialize arms")
-    lanes = [(get_family(spec.family), lane) for spec in specs.values() for lane in spec.lanes]
-    answers = [{"sub_scenario": family.sub_scenario, "ground_truth": lane.ground_truth} for family, lane in lanes]
+    answers = [
+        {"sub_scenario": _sub_scenario(spec), "ground_truth": lane.ground_truth}
+        for spec in specs.values()
+        for lane in spec.lanes
+    ]
     commonest, version = commonest_answers(answers), lanes_version(workspace, categories)
     return [_lane_item(specs[row["scenario_id"]], row, commonest, version) for row in rows]
 
 
+def _sub_scenario(spec: TwoEventsSpec) -> str:
+    return spec.kind if isinstance(spec, RecordedEvents) else get_family(spec.family).sub_scenario
+
+
 def _lane_item(spec: TwoEventsSpec, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:
-    item, family = LaneItem(spec.scenario_id, *str(row["item"]).split(".")), get_family(spec.family)
-    decisive: dict[str, Any] = {
-        "item_id": item.item_id,
-        "pair_id": item.pair_id,
-        "dataset": TWO_EVENTS,
-        "scenario_id": spec.scenario_id,
-        "side": item.side,
-        "taxonomy": family.taxonomy,
-        "category": spec.category,
-        "sub_scenario": family.sub_scenario,
-        "question": row["question"],
-        "labels": list(row["labels"]),
-        "aliases": json.dumps(spec.aliases),
-        "answer_type": spec.answer_type,
-        "ground_truth": row["ground_truth"],
-        "control_answer": spec.lanes[LANES.index(item.lane)].ground_truth,
-        "media_digest": row["media_digest"],
-    }
-    return _row(decisive, decisive, commonest, row["clip"], version)
+    item = LaneItem(spec.scenario_id, *str(row["item"]).split("."))
+    words = {"sub_scenario": _sub_scenario(spec), "labels": row["labels"], "aliases": json.dumps(spec.aliases)}
+    decisive = _decisive(
+        {**spec.model_dump(exclude={"lanes"}), **words, "taxonomy": taxonomy_of_category(spec.category)},
+        dataset=TWO_EVENTS,
+        side=item.side,
+        question=row["question"],
+        ground_truth=row["ground_truth"],
+        control_answer=spec.lanes[LANES.index(item.lane)].ground_truth,
+        media_digest=row["media_digest"],
+    )
+    return _row(decisive | {"item_id": item.item_id, "pair_id": item.pair_id}, words, commonest, row["clip"], version)
 
 
 def _arm_item(spec: Record, row: Record, commonest: Mapping[str, str], version: str) -> ItemRow:

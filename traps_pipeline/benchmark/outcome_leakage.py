@@ -7,7 +7,6 @@ outcome without knowing physics.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,25 +15,13 @@ MAX_GAIN = 0.05  # maximum accuracy above always giving the commonest outcome
 MIN_RECORDS = 100  # records of a family; fewer cannot tell such a leakage from chance
 
 
-@dataclass(frozen=True)
-class OutcomeLeakage:
-    """Accuracy of predicting the outcomes.
+def outcome_leakage(
+    states: Sequence[Sequence[float] | np.ndarray], outcomes: Sequence[str]
+) -> tuple[float, float] | None:
+    """Return how often outcomes are predicted from records' states, and by the commonest one; None if one is too rare.
 
-    best: accuracy of the better of two cross-validated classifiers of the states, which favours them; prior: accuracy
-    of always giving the commonest outcome.
+    The first is the accuracy of the better of two cross-validated classifiers, which favours them.
     """
-
-    best: float
-    prior: float
-
-    @property
-    def gain(self) -> float:
-        """Accuracy that the state adds to the commonest outcome."""
-        return self.best - self.prior
-
-
-def outcome_leakage(states: Sequence[Sequence[float] | np.ndarray], outcomes: Sequence[str]) -> OutcomeLeakage | None:
-    """Return how well records' states predict outcomes; None if one is too rare."""
     from sklearn.ensemble import ExtraTreesClassifier
     from sklearn.linear_model import LogisticRegression
     from sklearn.model_selection import StratifiedKFold, cross_val_score
@@ -54,4 +41,4 @@ def outcome_leakage(states: Sequence[Sequence[float] | np.ndarray], outcomes: Se
     best = max(
         float(cross_val_score(classifier, features, list(outcomes), cv=folds).mean()) for classifier in classifiers
     )
-    return OutcomeLeakage(best, max(counts.values()) / len(outcomes))
+    return best, max(counts.values()) / len(outcomes)

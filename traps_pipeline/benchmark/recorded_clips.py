@@ -1,6 +1,7 @@
 """Make the clips of a recorded pair (control, void by cut, cover or another clip, and twin), and find them again."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,11 @@ import numpy as np
 from traps_pipeline.base.digests import digest, file_digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.files import write_bytes
-from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.footage import FPS, Footage, UnusableFootage, read_footage
 from traps_pipeline.benchmark.recorded_pairs import Board, RecordedPair
-from traps_pipeline.scenes.parts.look import LINE_SHARE, LINE_TONE, OCCLUDERS
+from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
+from traps_pipeline.scenes.parts.look import LINE_SHARE, OCCLUDERS, occluder_tones
 from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip
-from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.video.encode import DamagedClip
 
 FALL_S = 0.5  # in which a board comes, gaining speed evenly; the released boards fall for 0.39 to 0.61 s
@@ -25,7 +25,7 @@ BOARD_TONE = 0.86  # of its colour under the simulator's light
 
 @dataclass(frozen=True)
 class RecordedClips:
-    """A pair's clips by side, each frames (H, W, 3); how the void hides; evidence and remarks on them."""
+    """A scenario's clips by side, each frames (H, W, 3); how the void hides; evidence and remarks on them."""
 
     clips: dict[str, list[np.ndarray]]
     void: dict[str, Any]
@@ -45,8 +45,10 @@ def make_clips(pair: RecordedPair, folder: Path) -> RecordedClips:
         except UnusableFootage as error:
             raise UnusableFootage(f"{side} {name}: {error}") from error
         notes += [f"{side} {name}: {note}" for note in footage[side].notes]
-    control = footage["control"]
-    sides = {side: each.frames for side, each in footage.items()}
+    control, sides = footage["control"], {side: each.frames for side, each in footage.items()}
+    evidence: dict[str, Any] = {"source": pair.source, "licence": pair.licence, "originals": originals}
+    if pair.control_cover:
+        evidence["control_cover"] = [_box(board, control) for board in pair.control_cover]
     if pair.void is not None:
         _require_alike(sides["control"], sides["void"], "void")
         hiding: dict[str, Any] = {"hidden_from_frame": 0}
@@ -58,12 +60,20 @@ def make_clips(pair: RecordedPair, folder: Path) -> RecordedClips:
                 "its ends"
             )
         sides["void"], hiding = control.frames[:cut], {"cut_frame": cut}
+    elif pair.two_events:
+        boards = {True: [[board] for board in pair.cover], False: [[board] for board in pair.control_cover] or [[], []]}
+        for name, hidden in LANE_CLIPS.items():
+            sides[name] = _covered(control, pair, [*boards[hidden[0]][0], *boards[hidden[1]][1]])
+        del sides["control"]
+        hides, stands = (
+            [[_span(b, pair, control) for b in each] for each in boards[hidden]] for hidden in (True, False)
+        )
+        boxes = [_box(board, control) for board in pair.cover]
+        return RecordedClips(sides, {"hides": hides, "stands": stands, "cover": boxes}, evidence, notes)
     else:
-        assert pair.cover is not None, "a pair has a void"
-        box, frame = _box(pair.cover, control), _frame(pair.cover.from_s, pair, control)
-        hiding = {"hidden_from_frame": frame, "cover": list(box)}
+        (board,) = pair.cover
+        hiding = {"hidden_from_frame": _span(board, pair, control)[0], "cover": _box(board, control)}
         sides["void"] = _covered(control, pair, pair.cover)
-    evidence: dict[str, Any] = {"source": pair.source, "licence": pair.licence, "originals": originals}
     if pair.twin is not None:
         evidence |= _twin_proof(pair, footage["twin"], hiding, sides["void"])
         differs = f"differs in {evidence['twin_px']:,} pixels of {len(sides['void'])} frames, by at most"
@@ -72,24 +82,19 @@ def make_clips(pair: RecordedPair, folder: Path) -> RecordedClips:
             if evidence["twin_px"]
             else f"twin {pair.twin}: its void is the same byte for byte"
         )
-    if pair.control_cover is not None:
-        sides["control"] = _covered(control, pair, pair.control_cover)
-        evidence["control_cover"] = list(_box(pair.control_cover, control))
+    sides["control"] = _covered(control, pair, pair.control_cover)
     return RecordedClips(sides, hiding, evidence, notes)
 
 
 def video_path(folder: Path, name: str) -> Path:
     """Return the path of a video below a folder. Raises UnusableFootage."""
-    try:
+    with suppress(OSError, RuntimeError):  # a name that is too long, or links in a circle
         path = (folder / name).resolve()
-        is_there, is_inside = path.is_file(), path.is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # a name that is too long, or links in a circle
-        is_there, is_inside, path = False, True, folder
-    if not is_inside:
-        raise UnusableFootage("lies outside the folder; copy it into it")
-    if not is_there:
-        raise UnusableFootage("is not there; correct its path, which begins in the folder")
-    return path
+        if not path.is_relative_to(folder.resolve()):
+            raise UnusableFootage("lies outside the folder; copy it into it")
+        if path.is_file():
+            return path
+    raise UnusableFootage("is not there; correct its path, which begins in the folder")
 
 
 def _require_alike(frames: Sequence[np.ndarray], others: Sequence[np.ndarray], side: str) -> None:
@@ -101,7 +106,7 @@ def _require_alike(frames: Sequence[np.ndarray], others: Sequence[np.ndarray], s
         )
 
 
-def _box(board: Board, control: Footage) -> tuple[int, int, int, int]:
+def _box(board: Board, control: Footage) -> list[int]:
     """Return a board's place in the clip (px): x, y, width, height; no pixel that it covers stays in part."""
     (seen_width, seen_height), (height, width) = control.seen, control.frames[0].shape[:2]
     if board.x + board.width > seen_width or board.y + board.height > seen_height:
@@ -111,31 +116,33 @@ def _box(board: Board, control: Footage) -> tuple[int, int, int, int]:
     right, bottom = np.ceil(scale * (board.x + board.width, board.y + board.height)).astype(int).tolist()
     if right - left < 8 or bottom - top < 8:
         raise UnusableFootage(f"cover: is {right - left} x {bottom - top} pixels in the clip; cover 8 or more each way")
-    return left, top, right - left, bottom - top
+    return [left, top, right - left, bottom - top]
 
 
-def _frame(at_s: float, pair: RecordedPair, control: Footage) -> int:
-    return round(min(at_s - pair.start_s, len(control.frames) / FPS) * FPS)
+def _span(board: Board, pair: RecordedPair, control: Footage) -> tuple[int, int]:
+    """Return the frames from and until which a board stands. Raises UnusableFootage."""
+    first, last = (round(min(at_s - pair.start_s, len(control.frames) / FPS) * FPS) for at_s in board[:2])
+    if first >= len(control.frames):
+        raise UnusableFootage("cover: begins after the clip's end; its times are those of the original file")
+    return first, last
 
 
-def _covered(control: Footage, pair: RecordedPair, board: Board) -> list[np.ndarray]:
-    """Return frames over which a board stands between its times; it falls into the picture, and rises out of it.
+def _covered(control: Footage, pair: RecordedPair, boards: Iterable[Board]) -> list[np.ndarray]:
+    """Return frames over which boards stand between their times; each falls into the picture, and rises out of it.
 
     A board whose time begins with the clip stands from the first frame on; one whose time ends with it stays.
     """
-    left, top, width, height = _box(board, control)
-    first, last = _frame(board.from_s, pair, control), _frame(board.to_s, pair, control)
-    if first >= len(control.frames):
-        raise UnusableFootage("cover: begins after the clip's end; its times are those of the original file")
-    panel = _panel(width, height, pair.id)
     frames = [frame.copy() for frame in control.frames]
-    for number, frame in enumerate(frames):
-        away_s = max(first - number, number - last + 1 if last < len(frames) else 0, 0) / FPS
-        share = min(away_s / FALL_S, 1.0)
-        bottom = top + height - round((top + height) * (2 * share - share**2))  # as `coming_board` does
-        if bottom > 0:
-            visible = panel[-min(bottom, height) :]
-            frame[bottom - len(visible) : bottom, left : left + width] = visible
+    for board in boards:
+        (left, top, width, height), (first, last) = _box(board, control), _span(board, pair, control)
+        panel = _panel(width, height, pair.id)
+        for number, frame in enumerate(frames):
+            away_s = max(first - number, number - last + 1 if last < len(frames) else 0, 0) / FPS
+            share = min(away_s / FALL_S, 1.0)
+            bottom = top + height - round((top + height) * (2 * share - share**2))  # as `coming_board` does
+            if bottom > 0:
+                visible = panel[-min(bottom, height) :]
+                frame[bottom - len(visible) : bottom, left : left + width] = visible
     return frames
 
 
@@ -143,17 +150,16 @@ def _panel(width: int, height: int, name: str) -> np.ndarray:
     """Return a board's picture, in a colour of the simulated ones: slats under a paler upper edge."""
     colours = [*OCCLUDERS.values()]
     colour = BOARD_TONE * np.array(colours[int(digest(name)[:8], 16) % len(colours)])
-    panel = np.broadcast_to(colour, (height, width, 3)).copy()
-    thickness = max(1, round(LINE_SHARE * height / 2))
-    panel[height // 2 : height // 2 + thickness] = np.minimum(1.0, LINE_TONE * colour + 0.06)
-    panel[: max(2, round(EDGE_SHARE * height))] = EDGE_TONE * colour
-    return np.rint(255 * panel).astype(np.uint8)
+    down = np.arange(height) - height // 2
+    panel = occluder_tones(colour, (down >= 0) & (down < max(1, round(LINE_SHARE * height / 2))))
+    panel[: max(2, round(EDGE_SHARE * height))] = np.rint(255 * EDGE_TONE * colour)
+    return np.repeat(panel[:, None], width, axis=1)
 
 
 def _twin_proof(pair: RecordedPair, twin: Footage, hiding: dict[str, Any], void: list[np.ndarray]) -> dict[str, Any]:
     """Return how the void that the twin makes differs from the control's: both have one where nothing does."""
     _require_alike(void, twin.frames, "twin")
-    frames = twin.frames[: hiding["cut_frame"]] if pair.cover is None else _covered(twin, pair, pair.cover)
+    frames = _covered(twin, pair, pair.cover)[: hiding.get("cut_frame")]
     if len(frames) != len(void):
         raise UnusableFootage(f"twin {pair.twin}: lasts {len(frames) / FPS:.1f} s, the void {len(void) / FPS:.1f} s")
     difference = np.abs(np.stack(frames).astype(np.int16) - np.stack(void))
@@ -168,26 +174,21 @@ def clip_path(folder: Path, scenario_id: str, side: str) -> Path:
     return folder / "clips" / scenario_id / f"{side}.mp4"
 
 
-def clip_problems(record: SceneSpec, released: Path) -> list[str]:
-    """Return which of a record's clips are missing or altered, in words."""
-    paths = {clip_path(released, record.scenario_id, side): sha256 for side, sha256 in record.params["clips"].items()}
-    advice = "is missing or not the clip that was imported; import the folder again"
-    return [f"{path}: {advice}" for path, sha256 in paths.items() if not _is_whole(path, sha256)]
+def is_whole(path: Path, sha256: str) -> bool:
+    """Return whether a clip with its note is there, and is the one that was imported."""
+    with suppress(DamagedClip):
+        return (clip := read_clip(path)) is not None and clip.file_sha256 == sha256
+    return False
 
 
-def _is_whole(path: Path, sha256: str) -> bool:
-    try:
-        clip = read_clip(path)
-    except DamagedClip:
-        return False
-    return clip is not None and clip.file_sha256 == sha256
+def copy_clips(released: Path, scenario_id: str, clips: Mapping[str, str], targets: Mapping[str, Path]) -> None:
+    """Copy a scenario's clips, with their notes, to a study's files by side. Raises TrapsError for an altered clip.
 
-
-def copy_clips(spec: SceneSpec, targets: Iterable[tuple[str, Path]]) -> None:
-    """Copy a pair's clips, with their notes, to a study's files by side. Raises TrapsError for an altered clip."""
-    if problems := clip_problems(spec, RELEASED):
-        raise TrapsError(problems[0])
-    for side, target in targets:
-        clip = clip_path(RELEASED, spec.scenario_id, side)
+    clips: their digests by side, as the record has them.
+    """
+    for side, target in targets.items():
+        clip = clip_path(released, scenario_id, side)
+        if not is_whole(clip, clips[side]):
+            raise TrapsError(f"{clip}: is missing or not the clip that was imported; import the folder again")
         write_bytes(target, clip.read_bytes())
         write_bytes(note_of(target), note_of(clip).read_bytes())

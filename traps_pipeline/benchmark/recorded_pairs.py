@@ -16,26 +16,14 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.base.yamlfile import check_line, faults_of, read_unchecked_lines
-from traps_pipeline.scenes.worlds.spec import Slug
+from traps_pipeline.scenes.worlds.spec import Slug, check_labels
 
 TABLES = ("pairs.csv", "pairs.jsonl")
-MAX_ROWS, MAX_BYTES = 10_000, 64 * 2**20
+MAX_ROWS = 10_000
 _VOIDS = ("void", "cut_s", "cover")
 Text = Annotated[str, Field(min_length=1, max_length=2000)]
 Seconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
-
-
-class Board(NamedTuple):
-    """A board over a part of the picture (px of the original as it is seen), between two times (s)."""
-
-    from_s: Seconds
-    to_s: Annotated[float, Field(gt=0)]
-    x: Annotated[int, Field(ge=0)]
-    y: Annotated[int, Field(ge=0)]
-    width: Annotated[int, Field(ge=1)]
-    height: Annotated[int, Field(ge=1)]
 
 
 def _split(separator: str | None) -> BeforeValidator:
@@ -49,7 +37,20 @@ def _aliases(value: Any) -> Any:
     return {other.strip(): label.strip() for other, _, label in pairs} or value
 
 
-Cover = Annotated[Board, _split(None)]
+class Board(NamedTuple):
+    """A board over a part of the picture (px of the original as it is seen), between two times (s)."""
+
+    from_s: Seconds
+    to_s: Annotated[float, Field(gt=0)]
+    x: Annotated[int, Field(ge=0)]
+    y: Annotated[int, Field(ge=0)]
+    width: Annotated[int, Field(ge=1)]
+    height: Annotated[int, Field(ge=1)]
+
+
+# One of each, or of two events one for either.
+Boards = Annotated[list[Annotated[Board, _split(None)]], _split("|"), Field(max_length=2)]
+Texts = Annotated[list[Text], _split("|")]
 
 
 class RecordedPair(BaseModel):
@@ -61,15 +62,16 @@ class RecordedPair(BaseModel):
     control: Text = Field(description="path of a clip in the folder, whose outcome can be seen")
     void: Text | None = Field(default=None, description="path of a clip whose outcome cannot be known")
     cut_s: Seconds | None = Field(default=None, description="the void is the control up to this time")
-    cover: Cover | None = Field(default=None, description="from_s to_s x y width height: the void's board")
-    control_cover: Cover | None = Field(default=None, description="the same for a board that comes in the control")
+    cover: Boards = Field(default=[], description="from_s to_s x y width height: the void's board")
+    control_cover: Boards = Field(default=[], description="the same for a board that comes in the control")
     twin: Text | None = Field(default=None, description="path of a clip of another outcome, with the same void")
     twin_answer: Text | None = Field(default=None, description="its answer")
-    question: Text = Field(description="of both clips")
-    choices: Annotated[list[Text], _split("|")] = Field(min_length=2, max_length=26, description="with | between")
-    answer: Text = Field(description="the right choice on the control")
+    two_events: Texts = Field(default=[], description="names of two events, each of which has a board and an answer")
+    question: Text = Field(description="of both clips; {} stands for the name of one of two events")
+    choices: Texts = Field(min_length=2, max_length=26, description="with | between")
+    answer: Texts = Field(description="the right choice on the control")
     aliases: Annotated[dict[str, str], BeforeValidator(_aliases)] = Field(default={}, description="other=choice|..")
-    ill_posed_question: Text = Field(description="question that the control cannot answer")
+    ill_posed_question: Text | None = Field(default=None, description="question that the control cannot answer")
     start_s: Seconds = Field(default=0.0, description="where the clip begins in the file")
     end_s: Seconds | None = Field(default=None, description="where it ends")
     source: Text = Field(description="where the video is from")
@@ -85,27 +87,29 @@ class RecordedPair(BaseModel):
 
     @model_validator(mode="after")
     def _agrees(self) -> RecordedPair:
-        if len({*self.choices}) < len(self.choices):
-            raise ValueError("choices repeat")
-        for name, label in (("answer", self.answer), ("twin_answer", self.twin_answer)):
-            if label not in (*self.choices, None):
-                raise ValueError(f"{name} {label!r} is not one of the choices{did_you_mean(str(label), self.choices)}")
-        if unknown := sorted({*self.aliases.values()} - {*self.choices}):
-            raise ValueError(f"aliases name {unknown[0]!r}, which is not one of the choices")
-        given = [name for name in _VOIDS if getattr(self, name) is not None]
+        check_labels(self.choices, self.aliases, [*self.answer, *filter(None, [self.twin_answer])])
+        given = [name for name in _VOIDS if getattr(self, name) not in (None, [])]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(_VOIDS)}, not {' and '.join(given) or 'none'}")
-        if (self.twin is None) != (self.twin_answer is None) or self.twin_answer == self.answer:
+        if (self.twin is None) != (self.twin_answer is None) or self.twin_answer == self.answer[0]:
             raise ValueError("twin and twin_answer go together, and its answer is another one")
-        if self.twin is not None and self.void is not None:
-            raise ValueError("twin goes with cut_s or cover, where the two have one void")
-        end = self.end_s if self.end_s is not None else float("inf")
-        boards = [board for board in (self.cover, self.control_cover) if board is not None]
+        if self.twin is not None and (self.void is not None or self.two_events):
+            raise ValueError("twin goes with cut_s or one cover, where the two have one void")
+        boards, end = [*self.cover, *self.control_cover], float("inf") if self.end_s is None else self.end_s
         if any(board.from_s >= board.to_s for board in boards):
             raise ValueError("a board is from_s to_s x y width height, with from_s before to_s")
         times = [self.cut_s, *(board.from_s for board in boards)]
         if end <= self.start_s or any(at is not None and not self.start_s <= at < end for at in times):
             raise ValueError("times lie between start_s and end_s, in seconds of the original file")
+        n_events = 2 if self.two_events else 1
+        if {len(self.answer), len(self.cover) or n_events, len(self.control_cover) or n_events} != {n_events}:
+            raise ValueError("two_events have two answers and two boards, with | between, and a pair has one of each")
+        if not self.two_events and self.ill_posed_question is None:
+            raise ValueError("ill_posed_question: is missing; add it")
+        if self.two_events and (given != ["cover"] or len({*self.two_events}) != 2 or "{}" not in self.question):
+            raise ValueError("two_events are two names with | between, for {} in the question, and a cover for each")
+        if self.two_events and max(b.x + b.width for b in boards[::2]) > min(b.x for b in boards[1::2]):
+            raise ValueError("two_events stand side by side: name the left one first, with boards that do not overlap")
         return self
 
 
@@ -120,19 +124,16 @@ def read_pairs(folder: Path) -> tuple[list[RecordedPair], list[str]]:
     for number, row in _rows(tables[0]):
         if number > MAX_ROWS:
             raise TrapsError(f"{tables[0]}: has more than {MAX_ROWS:,} pairs; import it in parts")
-        where = f"{tables[0].name}:{number}"
         try:
             if isinstance(row, str):
                 raise ValueError(row)
-            if any(name.startswith("two_events") for name in row):
-                raise ValueError("two_events are not imported yet; leave such rows and columns out")
             pair = RecordedPair.model_validate(row)
             if pair.id in pairs:
                 raise ValueError(f"id {pair.id!r} stands there twice")
             pairs[pair.id] = pair
         except ValueError as error:
             reason = faults_of(error, RecordedPair) if isinstance(error, ValidationError) else str(error)
-            problems.append(f"{where}: {reason}; correct that line")
+            problems.append(f"{tables[0].name}:{number}: {reason}; correct that line")
     return [*pairs.values()], problems
 
 
@@ -148,14 +149,8 @@ def _rows(table: Path) -> Iterator[tuple[int, dict[str, Any] | str]]:
             yield number, row if isinstance(row, dict | str) else "is no JSON object"
         return
     try:
-        if table.stat().st_size > MAX_BYTES:
-            raise ValueError("is larger than 64 MB")
-        reader = csv.DictReader(io.StringIO(table.read_text(encoding="utf-8-sig"), newline=""), strict=True)
-        for row in reader:
-            surplus = {"too many values": row[None]} if None in row else {}
-            yield (
-                reader.line_num,
-                {str(k): v for k, v in row.items() if k is not None and v not in ("", None)} | surplus,
-            )
+        text = io.StringIO(table.read_text(encoding="utf-8-sig"), newline="")
+        for row in (reader := csv.DictReader(text, restkey="more values than names", strict=True)):
+            yield reader.line_num, {name: value for name, value in row.items() if value not in ("", None)}
     except (ValueError, csv.Error, OSError) as error:  # UnicodeDecodeError is a ValueError
         raise TrapsError(f"{table}: {error}; save it as CSV in UTF-8 with the columns of docs/recorded.md") from error

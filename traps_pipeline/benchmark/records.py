@@ -124,19 +124,21 @@ def _line(line: str, where: str, parse: Callable[[str, str], Record]) -> Release
 
 def parse_record(line: str, where: str) -> SceneSpec:
     """Parse a released file's line. Raises TrapsError."""
-    return _parse(SceneSpec, line, where)
+    return _parse(lambda _: SceneSpec, line, where)
 
 
 def parse_two_events(line: str, where: str) -> TwoEventsSpec:
     """Parse a line of records of two events. Raises TrapsError."""
-    from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
+    from traps_pipeline.scenes.worlds.lane_records import RecordedEvents, TwoEventsSpec
 
-    return _parse(TwoEventsSpec, line, where)
+    kinds = {True: RecordedEvents, False: TwoEventsSpec}
+    return _parse(lambda fields: kinds[isinstance(fields, dict) and fields.get("family") == RECORDED], line, where)
 
 
-def _parse(kind: type[Record], line: str, where: str) -> Record:
+def _parse(kind: Callable[[Any], type[Record]], line: str, where: str) -> Record:
     try:
-        spec = kind.model_validate(from_json(line))  # twice as fast as `json`, with the same numbers
+        fields = from_json(line)  # twice as fast as `json`, with the same numbers
+        spec = kind(fields).model_validate(fields)
     except ValidationError as error:
         raise TrapsError(f"{where}: not a valid record ({faults_of(error)}); restore the line from git") from error
     except ValueError as error:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
+from traps_pipeline.base.paths import RELEASED
 from traps_pipeline.benchmark.recorded_clips import copy_clips
 from traps_pipeline.benchmark.sharing import RenderWork, Row, existing_clips, make_together
 from traps_pipeline.benchmark.specs import clips_version, released_in_study, spec_of, spec_rows, trajectory_of
@@ -37,9 +38,9 @@ def render_videos(workspace: Workspace, category: str, *, wait: bool = True) -> 
 
     def job(row: Row) -> Job | None:
         if row["family"] == RECORDED:
-            copy_clips(spec_of(row), zip(_sides(row), _clips(workspace, row), strict=True))
+            copy_clips(RELEASED, row["scenario_id"], json.loads(row["params"])["clips"], _clips(workspace, row))
             return None
-        are_here = [is_here(clip, row) for clip in _clips(workspace, row)]
+        are_here = [is_here(clip, row) for clip in _clips(workspace, row).values()]
         return None if all(are_here) else _job(workspace, row)
 
     tick = partial(_tick, category, len(specs))
@@ -71,10 +72,10 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
     """Return clips, and occluded voids' leaked pixels. Raises TrapsError if missing."""
     specs = spec_rows(workspace, category)
-    clips = existing_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row)))
+    clips = existing_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row).values()))
     version = clips_version(workspace, category, specs)
     rows = [row for spec in specs for row in _rows(workspace, spec, clips, version)]
-    voids = {row["scenario_id"]: clips[_clips(workspace, row)[1]].leaked_pixels for row in specs}
+    voids = {row["scenario_id"]: clips[_clips(workspace, row)["void"]].leaked_pixels for row in specs}
     return rows, {id_: pixels for id_, pixels in voids.items() if pixels is not None}
 
 
@@ -82,30 +83,25 @@ def _tick(category: str, total: int, finished: int) -> None:
     progress.current().tick("videos", f"{category}, scenarios", finished, total)
 
 
-def _sides(row: Row) -> list[str]:
-    """Return a scenario's clips: a recorded one may lack a twin."""
+def _clips(workspace: Workspace, row: Row) -> dict[str, Path]:
+    """Return a scenario's clips by side: a recorded one may lack a twin."""
     recorded = json.loads(row["params"])["clips"] if row["family"] == RECORDED else CLIPS
-    return [side for side in CLIPS if side in recorded]
-
-
-def _clips(workspace: Workspace, row: Row) -> list[Path]:
-    return [workspace.clip(row["scenario_id"], side, row["scene_hash"]) for side in _sides(row)]
+    return {s: workspace.clip(row["scenario_id"], s, row["scene_hash"]) for s in CLIPS if s in recorded}
 
 
 def _files(workspace: Workspace, row: Row) -> list[Path]:
-    return [file for clip in _clips(workspace, row) for file in (clip, note_of(clip))]
+    return [file for clip in _clips(workspace, row).values() for file in (clip, note_of(clip))]
 
 
 def _job(workspace: Workspace, row: Row) -> Job:
     trajectories = trajectory_of(workspace, row), trajectory_of(workspace, row, "twin")
-    control, void, twin = _clips(workspace, row)
-    return Job(spec_of(row), *trajectories, control, void, twin)
+    return Job(spec_of(row), *trajectories, *_clips(workspace, row).values())
 
 
 def _rows(workspace: Workspace, spec: Row, clips: Mapping[Path, Clip], version: str) -> list[VideoRow]:
     params = json.loads(spec["params"])
     rows, (width, height) = [], params["size"] if spec["family"] == RECORDED else frame_size(params)
-    for side, path in zip(_sides(spec), _clips(workspace, spec), strict=True):
+    for side, path in _clips(workspace, spec).items():
         clip = clips.get(path)
         if clip is None:
             raise TrapsError(f"{path}: was not rendered; run again")

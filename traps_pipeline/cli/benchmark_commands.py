@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -179,16 +178,17 @@ def import_pairs(arguments: argparse.Namespace) -> int:
     from traps_pipeline.benchmark.records import load_release
     from traps_pipeline.people.recorded_certificates import NOT_CERTIFIED
     from traps_pipeline.protocol.datasets import datasets_of_category
-    from traps_pipeline.scoring.power import scale_for
+    from traps_pipeline.scenes.worlds.spec import SceneSpec
+    from traps_pipeline.scoring.power import precision
 
     out = arguments.out.absolute()
     name = _name(arguments.name or out.name)
     say = partial(print, flush=True)
     records, problems = import_recorded(arguments.folder, out, name, workers=arguments.workers, report=say)
-    print(measure_leaks(records, out))
-    pairs = Counter(dataset for record in records for dataset in datasets_of_category(record.category))
-    needed = ", ".join(f"{name} {scale_for(pairs, 0.1) * n:,.0f}" for name, n in sorted(pairs.items()))
-    print(f"pairs for an interval of PECS of .1, with a model in the middle: about {needed}")
+    print(measure_leaks([record for record in records if isinstance(record, SceneSpec)], out))
+    datasets = {dataset for record in records for dataset in datasets_of_category(record.category)}
+    needed = 400 * (precision(dict.fromkeys(datasets, 400)).width / 0.1) ** 2  # as intervals of so many pairs shrink
+    print(f"pairs of each dataset for an interval of PECS of .1, with a model in the middle: about {needed:,.0f}")
     for problem in problems:
         print(f"traps: {problem}", file=sys.stderr)
     print(f"{count_noun(len(records), 'pair')} in {arguments.out}, {len(problems)} not imported; {NOT_CERTIFIED}")

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 SYSTEM = "You are asked about a video."
 QUESTIONS = ("Does it grow brighter?", "Does the picture end up bright, dark, or as it was?", "Which?")
 NEW_TOKENS = 8
+FLOAT_STEP = 4e-6  # of an outcome in float32, which a small gap does not outweigh
 CLOSE = 1e-4  # tolerances of effects, and of means relative to the largest state
 EXACT = ("float32",)  # in 16 bits rounding differs with the shape of a batch
 
@@ -231,12 +232,12 @@ def _check_patching(subject: Subject) -> str:
     full_patches = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]
     gap = source.margin - target.margin
+    tolerance = max(CLOSE * abs(gap), FLOAT_STEP)
     self_patched = np.abs(patched_changes(model, target, target, [*full_patches, *sites], tokens)).max()
-    _require(self_patched <= CLOSE * abs(gap), f"a patch with itself changes the outcome by {self_patched:.1e}")
-    deviations = np.abs(patched_changes(model, target, source, full_patches, tokens) / gap - 1)
+    _require(self_patched <= tolerance, f"a patch with itself changes the outcome by {self_patched:.1e}")
+    missed = np.abs(patched_changes(model, target, source, full_patches, tokens) - gap).max()
     _require(
-        bool(gap and deviations.max() <= CLOSE),
-        f"patching all positions misses the source's outcome by {deviations.max():.1e}",
+        bool(missed <= tolerance < abs(gap)), f"patching all positions misses the outcome, {gap:.1e}, by {missed:.1e}"
     )
     side_paths = {
         "deepstack features": target.visual is not None,

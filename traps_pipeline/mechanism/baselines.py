@@ -48,12 +48,10 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     assert entry.media is not None, "local entries have media"
     result: list[ProbeBaselineRow] = []
 
-    def add(features: str, rows: Sequence[Row], note: str | None = None) -> None:
+    def add(features: str, rows: Sequence[Row]) -> None:
         names = ("analysis", "source", "target", "scope", "value", "low", "high", "spread", "n_voids", "n_controls")
         result.extend(
-            ProbeBaselineRow(
-                **states.extraction.partition, features=features, note=note, **{name: row[name] for name in names}
-            )
+            ProbeBaselineRow(**states.extraction.partition, features=features, **{name: row[name] for name in names})
             for row in rows
         )
 
@@ -63,12 +61,9 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
     for number, (name, features) in enumerate(raw.items()):
         progress.current().tick("probe_baselines", f"of {states.extraction.key}", number + 1, len(raw) + 2)
         add(name, score_features(run, features))
-    try:
-        output = output_features(entry, states, states, [*items])
-        add(MARGIN, score_features(run, output[MARGIN], lambda states, void: IdentityScorer()))
-        add(LOGITS, score_features(run, output[LOGITS]))
-    except NoMargin as error:
-        add(MARGIN, [_undefined_row()], str(error))
+    for name, features in output_or_note("probe_baselines", entry, states, states, [*items]).items():
+        fit = fit_probe if name == LOGITS else lambda states, void: IdentityScorer()
+        add(name, score_features(run, features, fit))
     add(NOISE, noise_floor(run, settings.seed))
     return result
 
@@ -82,9 +77,8 @@ class IdentityScorer:
 
 
 def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
-    """Return the protocol's rows, nearest centroids too, on features in the place of states. fit: another probe."""
-    on = replace(run, read=lambda dataset, _: features[dataset], fit=fit)
-    return on.comparable_rows(0) + on.centroids(0)
+    """Return the protocol's rows on features in the place of states. fit: another probe."""
+    return replace(run, read=lambda dataset, _: features[dataset], fit=fit).comparable_rows(0)
 
 
 # --- features ---------------------------------------------------------------------------------------------------------
@@ -229,16 +223,3 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
             continue
         rows.append(group[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
     return rows
-
-
-def _undefined_row() -> Row:
-    null_figures = dict.fromkeys(("value", "low", "high", "spread"))
-    return {
-        "analysis": "held_out",
-        "source": "",
-        "target": "",
-        "scope": "all",
-        "n_voids": 0,
-        "n_controls": 0,
-        **null_figures,
-    }

@@ -102,7 +102,6 @@ class ProbeBaselineRow(ExtractionColumns):
     spread: Annotated[float | None, "of noise: standard deviation over draws"]
     n_voids: Annotated[int, "void items of the target"]
     n_controls: Annotated[int, "control items of the target"]
-    note: Annotated[str | None, "why there is no figure"]
 
 
 PROBE_BASELINES = Table(
@@ -204,7 +203,11 @@ Chance = Annotated[float | None, "95 % interval, scenarios resampled, probes hel
 class InteractionRow(JoinedColumns):
     """Whether features tell, of clips of two events, that the asked one is hidden; chance is 0.5."""
 
-    features: Annotated[str, "states; or a rival, 0.5 by design: pixels, words, or both added"]
+    features: Annotated[
+        str,
+        "states; or a rival: pixels, words, both added and length are at 0.5 by design, output margin and first-token "
+        "logits (with a probe) are what the model says",
+    ]
     layer: Annotated[int, "of the states; -1 for rivals"]
     held_out: Annotated[str, "what probes have not seen: scenarios or families"]
     chosen: Annotated[bool, "whether it is the layer at which pairs of other datasets transfer best, or a rival"]
@@ -214,6 +217,7 @@ class InteractionRow(JoinedColumns):
     within: Annotated[float, "share of these clips whose hidden event's question is scored above the other one"]
     within_low: Chance
     within_high: Chance
+    same: Annotated[float, "share of these clips with the same features under both questions"]
     confound: Annotated[float, "AUROC of the same probe over all eight items: the number of boards tells; no claim"]
     own_effect: Annotated[float, "rise of the score from no event hidden to the asked one alone, in its deviations"]
     other_effect: Annotated[float, "the same to the other one alone"]
@@ -237,7 +241,6 @@ class ItemScoreRow(JoinedColumns):
     scenario_id: shared.ScenarioId
     side: shared.Side
     layer: Annotated[int, "at which the dataset is read, chosen on pairs of other datasets"]
-    own: Annotated[float | None, f"{UNSEEN} and was fitted on the item's own dataset"]
     others: Annotated[float | None, f"{UNSEEN} and was fitted on the other datasets"]
     margin: Annotated[float | None, "log-odds that the first answer token begins an abstention, under this prompt"]
     abstained_standard: Annotated[bool | None, "verdict of run 1 under standard; null if undecided or not asked"]

@@ -1,8 +1,8 @@
 """Tell whether states hold an interaction: that the event that is asked about is the one that is hidden.
 
-Where a clip of two events hides exactly one, neither the clip nor the question tells alone, so that every rival that
-adds what they tell is at chance by design. Over all eight items the number of boards tells, with random weights too:
-that figure is the confound and claims nothing.
+Where a clip of two events hides exactly one, neither the clip nor the question tells alone, so that every raw input
+that adds what they tell is at chance by design; the model's output is a rival that may tell. Over all eight items the
+number of boards tells, with random weights too: that figure is the confound and claims nothing.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.mechanism.baselines import probed_items, raw_features
+from traps_pipeline.mechanism.baselines import output_or_note, probed_items, raw_features
 from traps_pipeline.mechanism.control_rows import STATES, InteractionRow
 from traps_pipeline.mechanism.gating import chosen_layers
 from traps_pipeline.mechanism.mechanism_rows import PROBES
@@ -61,6 +61,8 @@ def interaction_rows(workspace: Workspace, entry: ModelEntry, extraction: Extrac
     raw = raw_features({TWO_EVENTS: probed_items(workspace, states, TWO_EVENTS)}, entry.media, workspace.resolve)
     pixels, words = raw["all frames"][TWO_EVENTS], raw["question words"][TWO_EVENTS]
     rivals = {"pixels": pixels, "words": words, "both added": np.hstack([pixels, words])}
+    output = output_or_note("interaction", entry, states, states, [TWO_EVENTS])
+    rivals |= {name: features[TWO_EVENTS] for name, features in ({"length": raw["length"]} | output).items()}
     chosen, joined = _chosen_layer(workspace, states), states.joined
     by_layer = each_layer(lambda n: figures_of(states.read(TWO_EVENTS, n), design, *resampling), states.n_layers)
     figures = {(STATES, layer): of_layer for layer, of_layer in enumerate(by_layer)}
@@ -110,6 +112,7 @@ def figures_of(
             "within": float(won.mean()), "within_low": within_low, "within_high": within_high,
             "confound": float(auroc(design.asked, _unseen_scores(features, design.asked, fold_of, fold_of >= 0))),
             "own_effect": float(asked - neither), "other_effect": float(other - neither),
+            "same": _same_features(features[one_hidden], design.clips[one_hidden]),
             "n_clips": len(won), "n_scenarios": len(np.unique(design.scenarios)),
         }  # fmt: skip
     return result
@@ -122,6 +125,12 @@ def _unseen_scores(features: np.ndarray, label: np.ndarray, folds: np.ndarray, f
         train = (folds != fold) & fitted
         scores[folds == fold] = fit_probe(features[train], label[train]).scores(features[folds == fold])
     return scores.round(DECIMALS)
+
+
+def _same_features(features: np.ndarray, clips: np.ndarray) -> float:
+    """Return the share of clips whose features are the same under both questions, but for rounding."""
+    rounding = 1e-6 * np.abs(features).max()
+    return float(np.mean([np.ptp(features[clips == clip], axis=0).max() <= rounding for clip in np.unique(clips)]))
 
 
 def _within_clips(

@@ -30,12 +30,11 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
     rows, joined = list[ItemScoreRow](), states.joined
     for dataset in datasets:
         features = read_states(states, [*dict.fromkeys(table["dataset"])], layers[dataset])
-        scores: dict[str, np.ndarray] = {}
-        items = gate_items(table, features, shuffled=False, seed=settings.seed)
-        for name, source in (("own", f"one:{dataset}"), ("others", OTHER_DATASETS)):
-            if sources_of_gate(source, dataset, datasets):
-                decision = gate_answers(items, source, dataset, **probe_settings)
-                scores[name] = decision.score - decision.threshold[MID]
+        scores = np.full(len(states.dataset(dataset)), np.nan)
+        if sources_of_gate(OTHER_DATASETS, dataset, datasets):
+            items = gate_items(table, features, shuffled=False, seed=settings.seed)
+            decision = gate_answers(items, OTHER_DATASETS, dataset, **probe_settings)
+            scores = decision.score - decision.threshold[MID]
         for place, item in enumerate(states.dataset(dataset).to_dict("records")):
             abstained: dict[str, Any] = {
                 f"abstained_{regime}": _decision(outcome[dataset].abstained[place] if outcome else np.nan)
@@ -46,8 +45,7 @@ def item_score_rows(workspace: Workspace, entry: ModelEntry, states: StoredState
                     **joined,
                     **{name: item[name] for name in ("item_id", "dataset", "scenario_id", "side")},
                     layer=layers[dataset],
-                    own=_number(scores["own"][place]),
-                    others=_number(scores["others"][place]) if "others" in scores else None,
+                    others=_number(scores[place]),
                     margin=float(margins[dataset][place, 0]) if margins else None,
                     **abstained,
                 )

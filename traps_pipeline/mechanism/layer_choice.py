@@ -67,4 +67,6 @@ def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
     if not pairs:
         raise TrapsError("probes: no dataset has both sides, so no layer can be chosen; extract more hidden states")
     layers = sorted(set.intersection(*({*curves[pair]} for pair in pairs)))
+    # States that are the same for all items, as the embedding of the last token, order nothing: chance is no choice.
+    layers = [n for n in layers if any(abs(curves[pair][n] - 0.5) > ROUNDING for pair in pairs)] or layers
     return LayerChoice({n: float(np.mean([curves[pair][n] for pair in pairs])) for n in layers})

@@ -142,9 +142,6 @@ class ProbeRow(ExtractionColumns):
     all_sample_best: Annotated[bool, "whether this pair's transfer curve is highest at this layer (uses target labels)"]
     chosen: Annotated[bool, "whether the target is read at this layer, chosen on pairs of other datasets alone"]
     note: Annotated[str | None, "why there is no figure"]
-    made_of: Annotated[
-        str, "digest of states, confabulated scenarios and settings; while it is unchanged, nothing is fitted again"
-    ]
 
 
 PROBES = Table(

@@ -7,7 +7,7 @@ Gram matrix. Its optimum equals scikit-learn's up to rounding and takes a fracti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
@@ -34,9 +34,9 @@ class Split:
 class Probe:
     """A fitted probe: mean, scale, and weights (d,) that apply to standardised states."""
 
-    mean: np.ndarray
-    scale: np.ndarray
-    weights: np.ndarray
+    mean: np.ndarray = field(repr=False)
+    scale: np.ndarray = field(repr=False)
+    weights: np.ndarray = field(repr=False)
     intercept: float
 
     def scores(self, states: np.ndarray) -> np.ndarray:

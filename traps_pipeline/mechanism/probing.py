@@ -290,7 +290,7 @@ class ProbeRun:
         """Return shares of items that the source's nearest centroid assigns to void.
 
         The centroids of a taxonomy's two datasets come from the same controls, so these shares are too low for
-        controls; `baselines` has the same of noise.
+        controls.
         """
         splits, rows = splits or {name: self._split(name, layer) for name in self._own}, []
         for source, target in self._pairs:

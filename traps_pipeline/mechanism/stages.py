@@ -25,16 +25,19 @@ from traps_pipeline.mechanism.directions import (
 from traps_pipeline.mechanism.mechanism_rows import (
     DIRECTIONS,
     PROBE_ITEMS,
-    PROBES,
     DirectionRow,
     HiddenStatesRow,
     ProbeRow,
 )
 from traps_pipeline.mechanism.probe_items import other_clip
-from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
+from traps_pipeline.mechanism.probing import (
+    Confabulated,
+    NothingConfabulated,
+    ProbeRun,
+    confabulated_scenarios,
+)
 from traps_pipeline.mechanism.probing_versions import mechanism_entry, states_folder
 from traps_pipeline.mechanism.stored_states import StoredStates
-from traps_pipeline.mechanism.transfer_paths import CURVES
 from traps_pipeline.models.registry.entries import LOCAL, ModelEntry, get_model
 from traps_pipeline.models.registry.prompts import states_prompt
 from traps_pipeline.protocol.cells import Cell, Evaluation, Extraction, StatesCell
@@ -76,7 +79,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
     assert entry.media is not None, "local entries have media"
     items = workspace.tables.read(PROBE_ITEMS, {"dataset": cell.dataset}).to_dict("records")
     model = load_local_model(entry, inside=True, seed=cell.extraction.weights_seed)
-    system = states_prompt(settings.system, cell.extraction.text)
+    system = states_prompt(settings.system, cell.text)
     _check_layers(workspace, entry.id, model.n_layers)
     folder = states_folder(workspace, cell)
     asked_of = [
@@ -146,37 +149,16 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
 
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
-    """Return rows of an extraction's probes, the existing ones if no input changed."""
+    """Return rows of an extraction's probes."""
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     is_random = extraction.weights_seed is not None  # which answers nothing
     confabulated = Confabulated({}) if is_random else confabulations(workspace, extraction.model)
-    layers = settings.models[extraction.model]
-    made_of = digest(
-        [
-            states.digest,
-            {name: sorted(scenarios) for name, scenarios in confabulated.scenarios.items()},
-            dict(confabulated.problems),
-            [settings.probes.model_dump(mode="json"), layers.centroid, settings.seed, CURVES],
-        ]
-    )[:16]
-    known_rows = _known_rows(workspace, extraction, made_of)
-    if known_rows is not None:
-        return known_rows
-    centroid, n_layers = layers.centroid, states.n_layers
+    centroid, n_layers = settings.models[extraction.model].centroid, states.n_layers
     run = ProbeRun(states.items, states.read, n_layers, centroid, settings.probes, settings.seed, confabulated)
     tick = partial(progress.current().tick, "probes", f"layers of {extraction.key}")
     rows = run.rows(tick, comparable=is_random)
-    return [ProbeRow(**row, model=extraction.model, prompt=extraction.prompt, made_of=made_of) for row in rows]
-
-
-def _known_rows(workspace: Workspace, extraction: Extraction, made_of: str) -> list[ProbeRow] | None:
-    if workspace.tables.state(PROBES, extraction.partition) is None:
-        return None
-    rows = workspace.tables.read(PROBES, extraction.partition)
-    if set(rows["made_of"]) != {made_of}:
-        return None
-    return [ProbeRow(**{str(name): value for name, value in row.items()}) for row in rows.to_dict("records")]
+    return [ProbeRow(**row, model=extraction.model, prompt=extraction.prompt) for row in rows]
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES
 from traps_pipeline.mechanism.probing_versions import joined_models, states_folder
@@ -52,11 +51,6 @@ class StoredStates:
     def n_layers(self) -> int:
         """Number of layers, the embeddings included."""
         return int(self.items["n_layers"].iloc[0]) + 1
-
-    @property
-    def digest(self) -> str:
-        """Digest of the items and their states."""
-        return digest(sorted(zip(self.items["item_id"], self.items["states_key"], strict=True)))
 
     @property
     def joined(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from traps_pipeline.people.human_score_rows import HUMAN_ROW
 from traps_pipeline.people.labels import agreement_of, label_matrix
-from traps_pipeline.protocol.datasets import taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, taxonomy_of
 from traps_pipeline.scoring.bootstrap import (
     RESAMPLED_METRICS,
     RESAMPLES,
@@ -37,7 +37,8 @@ def human_row(labels: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 
     Without a label of a clip there is no row; overall is null until all four datasets have metrics.
     """
-    clips = labels.loc[labels["task"] == "answerability"].reset_index(drop=True)
+    is_clip = (labels["task"] == "answerability") & labels["dataset"].isin(DATASETS)
+    clips = labels.loc[is_clip].reset_index(drop=True)
     if clips.empty:
         return pd.DataFrame(columns=pd.Index(HUMAN_ROW.names))
     counts = decision_counts(clips).mul(stratum_weights(clips), axis=0)

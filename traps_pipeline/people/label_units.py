@@ -24,7 +24,7 @@ from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.models.registry.judges import panel_id
 from traps_pipeline.people.human_label_rows import PROTOCOL_FILE
 from traps_pipeline.people.judge_validation import sheet_rows
-from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
+from traps_pipeline.protocol.datasets import DATASETS, TWO_EVENTS, is_ill_posed
 from traps_pipeline.storage.benchmark_tables import ITEMS, current_rows
 from traps_pipeline.storage.workspace import Workspace
 
@@ -82,7 +82,8 @@ def label_units(workspace: Workspace, task: TaskName) -> pd.DataFrame:
 
 def _clips(workspace: Workspace) -> pd.DataFrame:
     columns = ["item_id", "dataset", "scenario_id", "side", "item_hash", "benchmark_version"]
-    items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS)
+    datasets = (*DATASETS, TWO_EVENTS) if is_recorded() else DATASETS  # people certify both kinds of recordings
+    items = workspace.tables.read_all(ITEMS, columns, dataset=datasets)
     verdicts = current_rows(workspace, VERDICTS, ["item_id", "n_valid", "unanimous"])
     judged = verdicts.loc[verdicts["n_valid"] > 0]
     contested_share = (~judged["unanimous"].astype(bool)).groupby(judged["item_id"]).mean()

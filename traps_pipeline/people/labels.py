@@ -21,7 +21,6 @@ from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.models.reading.judged_answers import is_correct
 from traps_pipeline.people.human_label_rows import HUMAN_AGREEMENT, HUMAN_LABELS, LABELS_FILE
 from traps_pipeline.people.label_units import ABOUT_ANSWERS, TASKS, TaskName, label_units, strata
-from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.protocol.ratings import AXES, INVALID, NO, YES
 from traps_pipeline.storage.benchmark_tables import ITEMS
 from traps_pipeline.storage.lines import NOT_WHOLE, read_checked
@@ -116,7 +115,7 @@ def human_labels(workspace: Workspace) -> pd.DataFrame:
 def _with_answers(workspace: Workspace, rows: pd.DataFrame) -> pd.DataFrame:
     """Add whether people's answers about clips abstain, or are correct on a control."""
     columns = ["item_id", "ground_truth", "answer_type", "labels", "aliases"]
-    items = workspace.tables.read_all(ITEMS, columns, dataset=DATASETS).set_index("item_id").to_dict("index")
+    items = workspace.tables.read_all(ITEMS, columns).set_index("item_id").to_dict("index")
 
     def right(row: Mapping[Any, Any]) -> bool:
         item = items[row["item_id"]]

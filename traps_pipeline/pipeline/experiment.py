@@ -12,14 +12,14 @@ from traps_pipeline.base.names import Name
 from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.base.suggestions import did_you_mean, nearest_name
 from traps_pipeline.base.yamlfile import name_file_in_errors, parse_yaml_model, read_yaml
-from traps_pipeline.benchmark.corrections import corrected_scenarios, current_benchmark, of_study
+from traps_pipeline.benchmark.corrections import categories_of, corrected_scenarios, current_benchmark, of_study
 from traps_pipeline.benchmark.records import refuse_recorded
 from traps_pipeline.models.registry.entries import LOCAL, get_model, local_models
 from traps_pipeline.models.registry.judges import load_panel, load_panels, require_panel
 from traps_pipeline.models.registry.user_registry import UserRegistry, add_entries
 from traps_pipeline.pipeline.wanted import evaluations_of
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.protocol.datasets import DATASETS, REPLACED, SCHEMAS, TWO_EVENTS, UNPAIRED
+from traps_pipeline.protocol.datasets import DATASETS, REPLACED, SCHEMAS, TWO_EVENTS, UNPAIRED, datasets_of_category
 from traps_pipeline.protocol.regimes import BY_NAME, PAPER_REGIMES, REGIMES, fields_of
 from traps_pipeline.storage.study import Asked, MechanismSettings, Settings, Study
 
@@ -177,11 +177,18 @@ def load_experiment(name: str) -> Experiment:
         for panel in (*experiment.own.panels, experiment.panel or ""):
             if nearest_name(panel, load_panels()):  # another one may be the workspace's own
                 load_panel(panel)
-        if experiment.scenarios is not None and experiment.benchmark == current_benchmark():
-            of_study(corrected_scenarios(), experiment.study)
+        pairs = {*experiment.datasets} & {*DATASETS}
+        if (experiment.scenarios or experiment.mechanism) and experiment.benchmark == current_benchmark():
+            categories = categories_of(of_study(corrected_scenarios(), experiment.study))
+            pairs &= {dataset for category in categories for dataset in datasets_of_category(category)}
+        if experiment.mechanism is not None and not pairs:
+            raise TrapsError(
+                f"mechanism: of {', '.join(experiment.datasets)} no dataset with scenarios consists of pairs, on which "
+                f"probes are fitted and layers chosen; add one of {', '.join(DATASETS)} and its scenarios"
+            )
         if physical := [
             *(model for model in experiment.models if get_model(model).backend in ("observer", "rule")),
-            *(dataset for dataset in experiment.datasets if dataset in UNPAIRED),
+            *(dataset for dataset in experiment.datasets if dataset in UNPAIRED and dataset != TWO_EVENTS),
         ]:
             refuse_recorded(", ".join(physical))
         for model in experiment.mechanism.models if experiment.mechanism else ():

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from traps_pipeline.base.names import check_name
-from traps_pipeline.protocol.datasets import DATASETS, EXTRACTED, UNPAIRED
-from traps_pipeline.protocol.regimes import PROBE_PROMPT, RANDOM_WEIGHTS, REGIMES, VQA_PROMPTS
+from traps_pipeline.protocol.datasets import DATASETS, EXTRACTED, TWO_EVENTS, UNPAIRED
+from traps_pipeline.protocol.regimes import GUIDED, PROBE_PROMPT, RANDOM_WEIGHTS, REGIMES, VQA_PROMPTS
 
 _EVALUATION = re.compile(r"(?P<model>.+?)__(?P<regime>[a-z]+)__run(?P<run>[1-9][0-9]*)")
 
@@ -127,6 +127,12 @@ class StatesCell:
     def partition(self) -> dict[str, Any]:
         """Values of the table's partition columns."""
         return {"dataset": self.dataset, **self.extraction.partition}
+
+    @property
+    def text(self) -> str:
+        """The VQA prompt that is read; two events are read under GUIDED, with random weights too."""
+        is_random = self.extraction.weights_seed is not None
+        return GUIDED if is_random and self.dataset == TWO_EVENTS else self.extraction.text
 
     @staticmethod
     def parse(key: str) -> StatesCell:

@@ -92,8 +92,9 @@ def extra_datasets_of(taxonomy: str) -> tuple[str, ...]:
 
 
 def arms_of_category(category: str) -> tuple[str, ...]:
-    """Return the arms and variations of a category's scenarios; none of recorded ones, which have no physics."""
-    return () if category in RECORDED_CATEGORIES else extra_datasets_of(taxonomy_of_category(category))
+    """Return the arms and variations of a category's scenarios; recorded ones, without physics, have two events."""
+    extra = extra_datasets_of(taxonomy_of_category(category))
+    return tuple(name for name in extra if name == TWO_EVENTS or category not in RECORDED_CATEGORIES)
 
 
 def all_datasets_of(category: str) -> tuple[str, ...]:

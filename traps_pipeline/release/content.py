@@ -15,6 +15,7 @@ from traps_pipeline.benchmark.corrections import load_two_events
 from traps_pipeline.benchmark.held_out import opaque_name
 from traps_pipeline.benchmark.records import Release, load_release
 from traps_pipeline.benchmark.specs import spec_of
+from traps_pipeline.benchmark.stored_evidence import judged_certificates
 from traps_pipeline.judging.panel import tasks_for
 from traps_pipeline.models.registry.prompts import load_prompt, system_prompt
 from traps_pipeline.people.recorded_certificates import recorded_verdicts
@@ -33,8 +34,6 @@ from traps_pipeline.release.released_rows import (
     SplitRow,
     TwoEventsRow,
 )
-from traps_pipeline.scenes.certification.certificates import certificates_for, pair_of, stored_evidence
-from traps_pipeline.scenes.certification.evidence import Claim
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.storage.benchmark_tables import ITEMS, SCENE_SPECS
@@ -183,12 +182,12 @@ def two_events_rows(content: Content) -> list[TwoEventsRow]:
 
 def certificate_rows(content: Content) -> list[CertificateRow]:
     """Return one row per certificate and scenario, evaluated on the record's numbers."""
-    return [row for spec in content.specs for row in _certificates(spec_of(dict(spec)), content)]
+    events = [spec for spec in content.two_events if spec.scenario_id in content.people]
+    specs = [*(spec_of(dict(row)) for row in content.specs), *events]
+    return [row for spec in specs for row in _certificates(spec, content)]
 
 
-def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]:
-    import numpy as np
-
+def _certificates(spec: SceneSpec | TwoEventsSpec, content: Content) -> Iterable[CertificateRow]:
     def row(name: str, about: str, promises: str, failure: str | None, evidence: Mapping[str, Any]) -> CertificateRow:
         return CertificateRow(
             scenario_id=spec.scenario_id,
@@ -201,18 +200,11 @@ def _certificates(spec: SceneSpec, content: Content) -> Iterable[CertificateRow]
             canary=content.release.canary,
         )
 
-    if spec.is_recorded:
+    if isinstance(spec, TwoEventsSpec) or spec.is_recorded:
         promises = "People who saw one clip at a time answered the control rightly and could not know the void."
         yield row("people", "void", promises, content.people[spec.scenario_id], spec.evidence)
         return
-    record_evidence, claim = stored_evidence(spec), Claim.of_record(spec)
-    empty_trajectory = np.empty((0, 0), np.float32)  # words are certified without a trajectory
-    for certificate in certificates_for(spec.void_kind):
-        words = certificate.about == "words"
-        evidence = (
-            {**certificate.measured(pair_of(spec, empty_trajectory, empty_trajectory))} if words else record_evidence
-        )
-        failure = certificate.failure(evidence, claim)
+    for certificate, evidence, failure in judged_certificates(spec):
         numbers = {n.name: evidence[n.name] for n in certificate.numbers if n.name in evidence}
         yield row(certificate.name, certificate.about, certificate.promises, failure, numbers)
 

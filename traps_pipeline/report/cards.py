@@ -160,13 +160,13 @@ def _failure(what: str, sources: Sources, error: Exception) -> str:
     return reason
 
 
-def picture_card(picture: Picture) -> Card:
-    """Return the card of a picture of clips."""
+def picture_card(picture: Picture, shows: str) -> Card:
+    """Return the card of a picture of clips, and what it says below."""
     try:
         pictures = {"": _picture(picture.name, picture.figure(), "webp")}
     except NotRun as reason:
         return Card(picture.name, picture.title, why=str(reason))
-    return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title))
+    return Card(picture.name, picture.title, _fragment("figures", pictures=pictures, alt=picture.title), shows=shows)
 
 
 def _name(report: TableReport | FigureReport) -> str:

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from traps_pipeline.models.registry.judges import BY_RULES
+from traps_pipeline.people.recorded_certificates import UNCERTIFIED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -140,9 +141,10 @@ class FigureReport:
         return f"{self.finding(results)} {self.doc}".strip()
 
     def inputs(self, results: Results) -> list[str]:
-        """Return the frames that it draws, with refusals and judges, as text."""
+        """Return the frames that it draws, with refusals, judges and certificates, as text."""
         frames: list[pd.DataFrame] = [getattr(results, name) for name in self.frames]
-        return [repr(rows.to_dict("split")) for rows in frames] + [repr(results.refused), results.judged_by]
+        said = [repr(results.refused), results.judged_by, results.certified]
+        return [repr(rows.to_dict("split")) for rows in frames] + said
 
     def files(self, results: Results) -> dict[str, bytes]:
         """Return PDF, SVG and PNG by path; empty if the figure was not run."""
@@ -155,10 +157,12 @@ class FigureReport:
         return {f"{folder('figures', results)}/{name}": content for name, content in files.items()}
 
     def figure(self, results: Results) -> Figure:
-        """Return the figure, with a note if rules judged. Raises NotRun without data."""
+        """Return the figure, with a note if rules judged, or people certify no pairs. Raises NotRun without data."""
         figure = self.make(results)
-        if BY_RULES in results.judged_by.lower() and _is_judged(self.reads):
-            _say_below(figure, BY_RULES)
+        is_by_rules = BY_RULES in results.judged_by.lower() and _is_judged(self.reads)
+        said = [BY_RULES] * is_by_rules + [UNCERTIFIED] * results.certified.startswith(UNCERTIFIED)
+        if said:
+            _say_below(figure, "\n".join(said))
         return figure
 
 
@@ -204,7 +208,7 @@ TABLE_REPORTS: tuple[TableReport, ...] = (
     TableReport("claims", "claims.claims", CLAIM_STAGES, title="What is claimed of a model"),
     TableReport("probes", "probe_tables.probes", ("probes", "probe_baselines"), paper=True,
         recomputed=("probe_means",), title="Probes"),
-    TableReport("gate", "control_reports.gate", ("gate", "probes", "probe_baselines"), title="Probe-gated abstention"),
+    TableReport("gate", "control_reports.gate", ("gate",)),
     TableReport("patching", "patching_tables.patching", ("patching",)),
     TableReport("cosines", "steering_tables.cosines", ("cosines",), paper=True,
         title="Void directions"),
@@ -239,12 +243,9 @@ FIGURE_REPORTS: tuple[FigureReport, ...] = (
         has_finding=True),
     FigureReport("leads", "States among their rivals", "expression_figures.leads", ("leads",), published=False,
         has_finding=True),
-    FigureReport("lens", "The margin by layer", "expression_figures.lens", ("lens",), published=False,
-        has_finding=True),
+    FigureReport("lens", "The margin by layer", "expression_figures.lens", ("lens",), published=False),
     FigureReport("patching", "Activation patching", "control_figures.patching", ("patching",), published=False,
         has_finding=True),
-    FigureReport("probe_curves", "Probe transfer by layer", "steering_figures.probe_curves", ("probes",),
-        published=False),
     FigureReport("confabulated_strip", "Probes on confabulated voids", "steering_figures.confabulated_strip",
         ("probes",)),
     FigureReport("dose_response", "Steering: dose and response", "steering_figures.dose_response",
@@ -262,7 +263,7 @@ def folder(kind: str, results: Results) -> str:
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write a line at a figure's foot, or along its right edge if there is no room."""
+    """Write lines at a figure's foot, or along its right edge if there is no room."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     from traps_pipeline.report.writing import SOFT, figure_style
@@ -274,7 +275,8 @@ def _say_below(figure: Figure, text: str) -> None:
             figure.supxlabel(text, x=0.99, ha="right", **look)
             return
         if isinstance(engine, ConstrainedLayoutEngine):
-            engine.set(rect=(0, 0, 1 - RIGHT_EDGE_IN / figure.get_figwidth(), 1))
+            edge_in = RIGHT_EDGE_IN * (1 + text.count("\n"))
+            engine.set(rect=(0, 0, 1 - edge_in / figure.get_figwidth(), 1))
         figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
 
 

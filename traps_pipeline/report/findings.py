@@ -9,9 +9,9 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.mechanism.control_rows import MODEL, STATES
 from traps_pipeline.protocol.datasets import SHORT
-from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.claims import CLAIMS, claim_frame, lead_rows
+from traps_pipeline.report.tables.claims import CLAIMS, claim_frame
+from traps_pipeline.report.tables.control_reports import lead_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,29 +53,6 @@ def leads(results: Results) -> Iterator[str]:
             for row in group.to_dict("records")
         ]
         yield f"{model}, AUROC of states and of the best rival: {'; '.join(parts)}."
-
-
-@_join_sentences
-def lens(results: Results) -> Iterator[str]:
-    """Yield how far voids lie above controls, by prompt, at the last two layers."""
-    for model, group in _models(results.lens):
-        means = group.groupby(["prompt", "layer"], observed=True).agg(
-            voids=("voids", "mean"), controls=("controls", "mean")
-        )
-        row_of = {(row["prompt"], row["layer"]): row for row in means.reset_index().to_dict("records")}
-        top = max(layer for _, layer in row_of)
-        if not all((prompt, layer) in row_of for prompt in PROMPTING for layer in (top, top - 1)):
-            continue
-        above = [
-            row_of[prompt, layer]["voids"] - row_of[prompt, layer]["controls"]
-            for layer in (top, top - 1)
-            for prompt in PROMPTING
-        ]
-        yield (
-            f"In {model}, voids lie {above[0]:+.1f} above controls in log-odds of abstaining under {PROMPTING[0]} and "
-            f"{above[1]:+.1f} under {PROMPTING[1]} at the last layer; one layer before, {above[2]:+.1f} and "
-            f"{above[3]:+.1f} (means over datasets)."
-        )
 
 
 @_join_sentences

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +69,11 @@ def report_parts(sources: Sources, address: LinkOf | None = explorer_address) ->
         )
         for report in sorted(FIGURE_REPORTS, key=lambda report: report.name not in first)
     ]
+    said = sources.study.certified
     pictures = [
-        Part("pictures", each.name, lambda each=each: picture_card(each), each.reads, lambda each=each: each.inputs)
+        Part(
+            "pictures", each.name, partial(picture_card, each, said), each.reads, lambda each=each: [each.inputs, said]
+        )
         for each in pair_pictures(sources.workspace)
     ]
     tables = [

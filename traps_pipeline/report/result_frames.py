@@ -117,12 +117,13 @@ class Results:
     corrected = table_frame(CORRECTED)
     composition = no_rows(["taxonomy", "category", "void", "n", "n_ill_posed"])  # n: well-posed pairs
     prompted_probes = table_frame(PROBES)  # under every prompt
-    prompted_baselines = table_frame(PROBE_BASELINES)  # under every prompt
     # PROBES rows under PROBE_PROMPT; the paper has only transfer, confabulated, shuffled, centroid_void.
-    probes = cached_property(lambda results: _probe_prompt_rows(results.prompted_probes))
+    probes = cached_property(
+        lambda results: results.prompted_probes.loc[results.prompted_probes["prompt"] == PROBE_PROMPT]
+    )
     cosines = no_rows(COSINES.names)  # at the steered layer of each model
     effects = no_rows(STEERING_EFFECTS.names)  # of void directions, doses in alpha, signs by label
-    baselines = cached_property(lambda results: _probe_prompt_rows(results.prompted_baselines))
+    baselines = table_frame(PROBE_BASELINES)  # under PROBE_PROMPT alone
     gate = table_frame(GATE)
     patching = table_frame(PATCHING)
     nulls = table_frame(STEERING_NULLS)
@@ -168,10 +169,6 @@ def _empty_frame(columns: Iterable[str]) -> pd.DataFrame:
     import pandas as pd
 
     return pd.DataFrame(columns=pd.Index([*columns]))
-
-
-def _probe_prompt_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows.loc[rows["prompt"] == PROBE_PROMPT]
 
 
 def datasets_of(cells: pd.DataFrame) -> list[str]:

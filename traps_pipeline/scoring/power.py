@@ -62,23 +62,11 @@ def precision(pairs: Mapping[str, int], shares: Shares | None = None, models: in
     if not counts:
         raise ValueError("no dataset has a pair")
     shares = shares or Shares()
-    studies = _studies(counts, shares, SEED)
+    observed, ends = studies = _studies(counts, shares, SEED)
+    low, high = interval(ends, observed, limits_of("pecs")).T
     scenarios = sum(max(pairs.get(name, 0) for name in DATASETS if taxonomy_of(name) == t) for t in TAXONOMIES)
     detectable = {m: _detectable(counts, shares, studies, scenarios, m) for m in {1, max(1, comb(models, 2))}}
-    return Precision(_width(*studies), detectable[1], detectable[max(detectable)])
-
-
-def scale_for(pairs: Mapping[str, int], width: float) -> float:
-    """Return by what factor to multiply the pairs so that PECS has an interval of a given width, to about 5 %."""
-    scale = 1.0
-    for _ in range(ROUNDS + 1):  # an interval shrinks with the square root of the pairs, but where they are few
-        scale *= (_width(*_studies([max(1, round(scale * n)) for n in pairs.values()], Shares(), SEED)) / width) ** 2
-    return scale
-
-
-def _width(observed: np.ndarray, ends: np.ndarray) -> float:
-    low, high = interval(ends, observed, limits_of("pecs")).T
-    return float(np.mean(high - low))
+    return Precision(float(np.mean(high - low)), detectable[1], detectable[max(detectable)])
 
 
 def _studies(counts: Sequence[int], shares: Shares, seed: int) -> tuple[np.ndarray, np.ndarray]:

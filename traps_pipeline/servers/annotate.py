@@ -23,7 +23,6 @@ from traps_pipeline.people.judge_validation import sheet_rows
 from traps_pipeline.people.label_units import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
 from traps_pipeline.people.labels import LABELS
 from traps_pipeline.protocol.cells import Cell, Evaluation
-from traps_pipeline.protocol.datasets import DATASETS
 from traps_pipeline.servers.labelstore import LabelStore, NotWaiting
 from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page_html, script, study_file
 from traps_pipeline.storage.benchmark_tables import ITEMS, VIDEOS
@@ -73,7 +72,7 @@ class Annotation:
     @cached_property
     def items(self) -> dict[str, dict[str, Any]]:
         """Question, ground truth and clip by item."""
-        rows = self.workspace.tables.read_all(ITEMS, ["item_id", "question", "ground_truth", "clip"], dataset=DATASETS)
+        rows = self.workspace.tables.read_all(ITEMS, ["item_id", "question", "ground_truth", "clip"])
         return {str(row["item_id"]): {str(k): v for k, v in row.items()} for row in rows.to_dict("records")}
 
     @cached_property

@@ -34,7 +34,7 @@ def flags(workspace: Workspace) -> pd.DataFrame:
 
 
 def queue(name: QueueName, scenarios: Sequence[str], reviewed: frozenset[str], flagged: pd.DataFrame) -> list[str]:
-    """Return the scenarios that a review queue offers, in order. flagged: `flags`."""
+    """Return the scenarios that a review queue offers, in order; reviewed ones stay only in `all`. flagged: `flags`."""
     if name == "all":
         return list(scenarios)
     waiting = [each for each in scenarios if each not in reviewed]

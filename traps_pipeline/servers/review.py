@@ -110,7 +110,7 @@ class Review:
         return frozenset(id_ for id_, correction in last.items() if is_reviewed([correction]))
 
     def queue(self, name: QueueName) -> list[str]:
-        """Return the scenarios of a queue (`queue.queue`)."""
+        """Return the scenarios that a queue of the review pages offers, in order."""
         return queue(name, list(self.specs), self.reviewed(), self.flags)
 
     def decide(self, sent: Decision) -> None:

@@ -274,6 +274,22 @@ def test_a_checkpoint_of_another_kind_is_refused(tmp_path: Path) -> None:
         load_local_model(entry("qwen3-vl", folder))
 
 
+@pytest.mark.parametrize(
+    ("kind", "named"),
+    [("SmolVLMProcessor", ("num2words", "pip install")), ("InternVLProcessor", ("start_image_token",))],
+)
+def test_a_processor_that_wants_a_package_or_a_token_that_is_not_there_is_refused_by_that_name(
+    tmp_path: Path, kind: str, named: tuple[str, ...]
+) -> None:
+    folder = altered(tmp_path)
+    for name in ("processor_config.json", "tokenizer_config.json", "video_preprocessor_config.json"):
+        if (folder / name).is_file():
+            config = json.loads((folder / name).read_text()) | {"processor_class": kind}
+            (folder / name).write_text(json.dumps(config))
+    with raises(TrapsError, "models.local.adapter._load", str(folder), *named):
+        load_local_model(entry("qwen3-vl", folder))
+
+
 def test_too_little_memory_says_how_much_is_needed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     folder = build_tiny("llava-next-video", tmp_path / "big", seed=5)
     monkeypatch.setattr("traps_pipeline.models.registry.checkpoint.free_bytes", lambda device: 1000.0)

@@ -125,12 +125,13 @@ def _load(checkpoint: Checkpoint, params: LocalParams, device: str, seed: int | 
             )
         else:
             network, report = _random_network(checkpoint, seed, common | {"dtype": options["dtype"]}), {}
-    except (OSError, ValueError, KeyError, ImportError, RuntimeError) as error:
+    except (OSError, ValueError, LookupError, ImportError, RuntimeError, AttributeError, TypeError) as error:
         message = " ".join(str(error).split())[:400]
+        lacks_package = isinstance(error, ImportError)  # as num2words, which the processor of SmolVLM wants
+        remedy = "install that package" if lacks_package else "save it again with this version"
         raise TrapsError(
             f"checkpoint {checkpoint.name}: transformers {transformers.__version__} cannot load it as an "
-            f"image-text-to-text model ({type(error).__name__}: {message}); name a checkpoint of such a class, or save "
-            "it again with this version"
+            f"image-text-to-text model ({type(error).__name__}: {message}); {remedy}, or name another checkpoint"
         ) from error
     unset = [*report.get("missing_keys", ()), *report.get("mismatched_keys", ())]
     if unset:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -52,8 +52,8 @@ class States:
     one after the final norm: the library's hidden_states[-1].
     """
 
-    raw: np.ndarray
-    normed: np.ndarray
+    raw: np.ndarray = field(repr=False)
+    normed: np.ndarray = field(repr=False)
 
 
 class LocalModel:

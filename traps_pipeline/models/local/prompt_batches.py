@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ class Prompt:
     """
 
     text: str
-    inputs: Mapping[str, Tensor]
+    inputs: Mapping[str, Tensor] = field(repr=False)
 
     @property
     def n_tokens(self) -> int:

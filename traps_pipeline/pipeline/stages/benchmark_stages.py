@@ -43,18 +43,18 @@ def corrections(workspace: Workspace, category: str) -> str:
     return corrections_version(workspace, category)
 
 
-def _specs_check(find: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
+def _specs_check(find: str, *about: str) -> Callable[[Workspace, str | None, StageOutput], Any]:
     """Return a check by what `find` (module.function of `benchmark`) finds wrong in a table's simulated records."""
     module, _, name = find.partition(".")
 
     def wrong(workspace: Workspace, key: str | None, output: StageOutput) -> Any:
         function = getattr(import_module(f"traps_pipeline.benchmark.{module}"), name)
-        return function([item.spec for item in output.beside if not item.spec.is_recorded])
+        return function([item.spec for item in output.beside if not item.spec.is_recorded], *about)
 
     return wrong
 
 
-_unbalanced = _specs_check("composition.problems")
+_unbalanced = _specs_check("composition.composition_problems")
 
 
 @_stage(
@@ -75,20 +75,20 @@ _unbalanced = _specs_check("composition.problems")
             "control_certified",
             "By the evidence in each record, the control can be answered: its outcome is settled in time, with a "
             "margin, and legible.",
-            _specs_check("stored_evidence.unanswerable_controls"),
+            _specs_check("stored_evidence.failed_certificates", "control"),
         ),
         Check(
             "void_certified",
             "By the evidence in each record, the void cannot be answered: the outcome is hidden without a trace and a "
             "twin has another answer (occlusion), or futures disagree (chaotic); nor can a control that an occluder "
             "closes be answered from its last frame. `traps benchmark certify` computes this again.",
-            _specs_check("stored_evidence.answerable_voids"),
+            _specs_check("stored_evidence.failed_certificates", "void", "twin", "worlds"),
         ),
         Check(
             "ill_posed_certified",
             "The inventory refutes each ill-posed question, or the question asks for what no video shows; neither "
             "holds for a well-posed question.",
-            _specs_check("stored_evidence.answerable_ill_posed"),
+            _specs_check("stored_evidence.failed_certificates", "words"),
         ),
         Check(
             "answers_balanced",

@@ -86,10 +86,10 @@ def _is_trained(_: StudyPartitions, key: str) -> bool:
 
 @_stage(
     tables.PROBE_BASELINES,  # on this machine, since the output margin needs the model's head
-    code="3",
+    code="4",
     parents=[_STATES, dep(probe_items, EVERY), dep(verdicts, ANSWERED_CELLS, need="none"), probing_settings],
     kinds=["parquet", "scikitlearn"],
-    wants=lambda study, key: _is_trained(study, key) and Extraction.parse(key).prompt in study.probed_prompts,
+    wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT,
 )
 def probe_baselines(workspace: Workspace, key: str) -> StageOutput:
     """Return probes on raw inputs, the output margin and noise instead of states."""
@@ -107,7 +107,7 @@ def _is_gated(partitions: StudyPartitions, key: str) -> bool:
 
 _gates = partial(
     _stage,
-    code="3",
+    code="4",
     parents=[*_COMPARED, dep(verdicts, _GATED, need="some")],
     wants=_is_gated,
 )
@@ -137,7 +137,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
     return StageOutput(lens_rows(workspace, *_model_and_states(workspace, key)))
 
 
-@_stage(tables.LEADS, parents=_COMPARED, wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT)
+@_stage(tables.LEADS, code="2", parents=_COMPARED, wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT)
 def leads(workspace: Workspace, key: str) -> StageOutput:
     """Return how states and rivals order each dataset's sides, of the model and its controls."""
     from traps_pipeline.mechanism.leads import lead_rows
@@ -153,6 +153,7 @@ def _with_two_events(key: str) -> list[str]:
 
 @_stage(
     tables.INTERACTION,
+    code="2",
     parents=[
         _STATES,
         dep(probes, to_keys(EXTRACTION, EXTRACTION, _with_two_events), need="some"),
@@ -170,7 +171,7 @@ def interaction(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(
     tables.ITEM_SCORES,
-    code="2",
+    code="3",
     parents=[_STATES, dep(probes, SAME), dep(verdicts, _GATED, need="none"), probing_settings],
     wants=_is_gated,
 )

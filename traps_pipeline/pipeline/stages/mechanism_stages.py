@@ -108,6 +108,7 @@ def _unsound_layers(workspace: Workspace, key: str | None, output: StageOutput) 
 
 @_stage(
     HIDDEN_STATES,
+    code="2",
     parents=[dep(probe_items, by_dataset), dep(extraction_settings, by_extraction)],
     scheme=schemes.STATES,
     kinds=["parquet", "pytorch"],
@@ -136,7 +137,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
 
 @_stage(
     PROBES,
-    code="3",
+    code="4",
     parents=[
         dep(hidden_states, by_extraction, need="some"),
         dep(verdicts, ANSWERED_CELLS, need="none"),

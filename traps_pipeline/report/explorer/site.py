@@ -264,6 +264,7 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
                 "labels": [*spec["labels"]],
                 "certificate": [words for _, words in certificate_phrases(evidence)]
                 + ([people[spec["scenario_id"]] or "certified by people"] if spec["scenario_id"] in people else []),
+                "by_people": spec["scenario_id"] in people,
                 "twin_answer": None if evidence.get("twin_px") else twin["ground_truth"] or None,
                 "twin_clip": twin_clip["path"] if twin_clip and not evidence.get("twin_px") else None,
                 "fps": control_clip["fps"] if control_clip else None,
@@ -276,21 +277,24 @@ def _scenarios(workspace: Workspace) -> list[dict[str, Any]]:
 def _lanes(workspace: Workspace, clips: set[str]) -> list[dict[str, Any]]:
     """Return the data about scenarios of two events: clips, when boards stand, and items in the order of a page."""
     rows = {(row["scenario_id"], row["item"]): row for row in records(workspace.tables.read_all(ARMS))}
-    scenarios = []
+    scenarios, people = [], recorded_verdicts(workspace.tables)
     for scenario in sorted({id_ for (id_, _), row in rows.items() if row["arm"] == TWO_EVENTS}):
         row_of = {item: rows[scenario, item.name] for item in lane_items(scenario)}
         path_of = {item.clip: row["clip"] if row["clip"] in clips else None for item, row in row_of.items()}
         evidence = {item.lane: json.loads(row["evidence"]) for item, row in row_of.items()}
-        n_frames, fps = next((row["n_frames"], each["fps"]) for row in row_of.values() for each in evidence.values())
+        n_frames, fps = int(next(iter(row_of.values()))["n_frames"]), evidence[LANES[0]]["fps"]
         standing = [sum(a <= k < b for lane in LANES for a, b in evidence[lane]["stands"]) for k in range(n_frames)]
         of_items = [{name: getattr(i, name) for name in ("pair_id", "side", "lane", "clip")} for i in row_of]
         scenarios.append(
             {
                 **{"scenario_id": scenario, "family": scenario.rpartition("-")[0], "fps": fps, "n_frames": n_frames},
                 "shown_at": max(k for k in range(n_frames) if standing[k] == min(standing)) / fps,
-                "lanes": [{"name": lane, "stands": evidence[lane]["stands"]} for lane in LANES],
+                "lanes": [
+                    {"name": n, "stands": evidence[n]["stands"], "hides": evidence[n].get("hides")} for n in LANES
+                ],
                 "clips": [{"name": n, "hidden": [*hidden], "path": path_of[n]} for n, hidden in LANE_CLIPS.items()],
                 "items": of_items,
+                "certificate": people.get(scenario),
             }
         )
     return scenarios

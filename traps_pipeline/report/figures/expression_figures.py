@@ -12,16 +12,8 @@ from traps_pipeline.protocol.datasets import SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.figures.looks import legend_key
 from traps_pipeline.report.result_frames import Results, datasets_of
-from traps_pipeline.report.tables.claims import (
-    CLAIMS,
-    OTHER_GATES,
-    RANDOM,
-    SUBJECT_NAMES,
-    SUBJECTS,
-    Claim,
-    claim_frame,
-    lead_rows,
-)
+from traps_pipeline.report.tables.claims import CLAIMS, RANDOM, SUBJECT_NAMES, SUBJECTS, Claim, claim_frame
+from traps_pipeline.report.tables.control_reports import OTHER_GATES, lead_rows
 from traps_pipeline.report.tables.inside_columns import why_not
 from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import (
@@ -43,36 +35,56 @@ if TYPE_CHECKING:
 
 CONTROL, VOID = COLOURS[0], COLOURS[1]
 HOLDS = "#b7e1cd"
+CLAIM_WORDS = (
+    "void: a question that its clip cannot answer; states: activations inside the network; random: the same network "
+    "with random weights;\nplacebo: answerable clips in the place of voids; rivals: words, pixels, length, the output; "
+    "pocket, no gap: a model that says all that it holds"
+)
 _LINES = dict(zip(PROMPTING, ("-", "--"), strict=True))
 
 
 def claims(results: Results) -> Figure:
     """Return which claims hold of each model, and in which of its controls the same holds.
 
-    A number is the figure of a claim; it is on colour where it reaches the claim's bound. A claim is held if it does so
-    in the model and in none of the controls that it must fail in, which are framed: the same network with random
-    weights (two seeds), answerable items in the place of voids (placebo), and a model that says all that it encodes.
+    A number is the figure of a claim, a row its bound. A claim is held if the model reaches the bound and no framed
+    control does: the same network with random weights (two seeds), answerable items in the place of voids (placebo),
+    rivals of states, and a model that says all that it encodes. Words say why there is no figure.
     """
     rows = claim_frame(results)
     if not len(rows):
         raise NotRun(why_not(results, "the paper has no such controls"))
     models, by_name = list(dict.fromkeys(rows["model"])), {claim.name: claim for claim in CLAIMS}
     with figure_style():
-        figure = new_figure(PAGE_IN, 0.7 + 0.2 * len(CLAIMS) * len(models) + 0.3 * len(models))
+        figure = new_figure(PAGE_IN, 0.9 + (0.2 * len(CLAIMS) + 0.4) * len(models))
         panels = figure.subplots(len(models), 1, squeeze=False)[:, 0]
         for ax, model in zip(panels, models, strict=True):
             part = rows.loc[rows["model"] == model].to_dict("records")
             for y, row in enumerate(part):
                 _claim_row(ax, y, row, by_name[row["claim"]])
             ax.set_yticks(range(len(part)), [f"{by_name[row['claim']].says}" for row in part], size=6.5)
-            ax.set_xticks(range(len(SUBJECTS)), [SUBJECT_NAMES[name] for name in SUBJECTS], size=6.5)
+            heads = [*(SUBJECT_NAMES[name].replace(" ", "\n", 1) for name in SUBJECTS), "holds\nfrom"]
+            ax.set_xticks(range(len(heads)), heads, size=6)
             ax.xaxis.tick_top()
-            ax.set(xlim=(-0.5, len(SUBJECTS) + 1.9), ylim=(len(part) - 0.5, -0.5))
+            ax.set(xlim=(-0.5, len(heads) + 2.1), ylim=(len(part) - 0.5, -0.5))
             ax.tick_params(length=0)
             ax.spines[:].set_visible(False)
             n_held = sum(row["verdict"] == "holds" for row in part)
-            ax.set_title(f"{plain(str(model))[:40]}: {n_held} of {len(part)} claims are held", size=7.5)
+            title = f"{plain(str(model))[:40]}: {n_held} of {len(part)} claims hold in the model and in no control"
+            ax.set_title(title, size=7.5, x=0, ha="left")
+        key: dict[str, Any] = {"title": CLAIM_WORDS, "title_fontsize": 6, "fontsize": 6, "alignment": "left"}
+        figure.legend(handles=_claim_keys(), loc="outside lower left", ncols=4, handlelength=1.2, **key)
     return figure
+
+
+def _claim_keys() -> list[Any]:
+    from matplotlib.patches import Patch
+
+    return [
+        Patch(facecolor=HOLDS, edgecolor=GRID, label="the model reaches the bound"),
+        Patch(facecolor="white", edgecolor=INK, label="a control that must stay below it"),
+        Patch(facecolor=VOID, edgecolor=INK, label="it does not: the claim fails"),
+        Patch(facecolor=GRID, edgecolor=GRID, label="reaches it, and does not count"),
+    ]
 
 
 def _claim_row(ax: Axes, y: int, row: Mapping[Any, Any], claim: Claim) -> None:
@@ -86,9 +98,11 @@ def _claim_row(ax: Axes, y: int, row: Mapping[Any, Any], claim: Claim) -> None:
         face = (VOID if must_fail else HOLDS if subject == MODEL else GRID) if reaches else "white"
         edge = INK if must_fail and is_known else GRID
         ax.add_patch(Rectangle((x - 0.44, y - 0.42), 0.88, 0.84, facecolor=face, edgecolor=edge, linewidth=0.7))
-        ax.text(x, y, fraction(figure, 2) if is_known else "–", ha="center", va="center", size=6.5)
+        look: dict[str, Any] = {"size": 6.5, "color": INK} if is_known else {"size": 4.4, "color": SOFT}
+        ax.text(x, y, fraction(figure, 2) if is_known else row[f"why_{subject}"], ha="center", va="center", **look)
     held = row["verdict"] == "holds"
-    ax.text(len(SUBJECTS) - 0.4, y, row["verdict"][:60], va="center", size=6.5, color=INK if held else SOFT,
+    ax.text(len(SUBJECTS), y, f"{claim.bound:g}", ha="center", va="center", size=6.5, color=SOFT)
+    ax.text(len(SUBJECTS) + 0.5, y, row["verdict"][:60], va="center", size=6.5, color=INK if held else SOFT,
             weight="bold" if held else "normal")  # fmt: skip
 
 

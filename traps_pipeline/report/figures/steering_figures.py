@@ -1,4 +1,4 @@
-"""Draw probe curves, the Cf->Cf strip, dose and response, and cosines."""
+"""Draw the Cf->Cf strip, dose and response, and cosines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from traps_pipeline.mechanism import effects
 from traps_pipeline.mechanism.transfer_paths import PATH_SETS, STEERING_PATHS, TRANSFER, TRANSFER_TYPES, path_name
-from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of, transfer_type
+from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed, taxonomy_of
 from traps_pipeline.report.figures.looks import legend_key, range_text
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import why_not
@@ -47,61 +47,6 @@ def _legend(figure: Figure, *more: Line2D, colours: Mapping[str, str] = COLOUR) 
 
 def _bar_key(label: str, width: float = 2.2, color: str = SOFT) -> Line2D:
     return legend_key(label, color, line="-", linewidth=width, solid_capstyle="butt")
-
-
-def probe_curves(results: Results) -> Figure:
-    """Return AUROC by layer of the twelve ordered pairs.
-
-    Each model has a row, each transfer type a column. The band shows label-shuffled probes within a dataset (mean ± 2
-    deviations over shuffles); a hollow marker is the layer chosen without the target's labels.
-    """
-    rows = results.probes
-    curves = rows.loc[(rows["analysis"] == "transfer") & rows["value"].notna()]
-    if not len(curves):
-        raise NotRun(why_not(results))
-    models = list(dict.fromkeys(curves["model"]))
-    with figure_style():
-        figure = new_figure(PAGE_IN, 0.65 + 1.75 * len(models))
-        axes = figure.subplots(len(models), 3, sharey=True, squeeze=False)
-        for line, model in zip(axes, models, strict=True):
-            for ax, crossing in zip(line, CROSSING, strict=True):
-                _curves(ax, curves.loc[curves["model"] == model], crossing)
-                _draw_shuffled_band(ax, rows.loc[(rows["analysis"] == "shuffled") & (rows["model"] == model)])
-                ax.set_title(f"{plain(model)[:24]}: {crossing}", size=7.5)
-            line[0].set_ylabel("AUROC on the target")
-        for ax in axes[-1]:
-            ax.set_xlabel("layer (0: embeddings)")
-        axes[0, 0].set_ylim(min(0.35, float(curves["value"].min()) - 0.03), 1.02)
-        shuffled_key = _bar_key("labels shuffled, mean ± 2 sd", 7, GRID)
-        _legend(figure, legend_key("layer chosen without the target", SOFT, "o", markerfacecolor="white"), shuffled_key)
-    return figure
-
-
-def _curves(ax: Axes, curves: pd.DataFrame, crossing: str) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    for key, curve in curves.groupby(["source", "target"], sort=False):
-        source, target = str(key[0]), str(key[1])  # pyright: ignore[reportIndexIssue]
-        if transfer_type(source, target) != crossing:
-            continue
-        curve = curve.sort_values("layer")
-        marker_step = max(1, len(curve) // 8)
-        style: dict[str, Any] = {"color": COLOUR[source], "marker": MARKER[target], "markersize": 3.2}
-        line: dict[str, Any] = {**style, "linestyle": LINE[source], "linewidth": 0.9, "markevery": marker_step}
-        ax.plot(curve["layer"], curve["value"], **line)
-        chosen_layers = curve.loc[curve["chosen"]]
-        style |= {"markersize": 5, "markerfacecolor": "white", "linestyle": "none"}
-        ax.plot(chosen_layers["layer"], chosen_layers["value"], **style)
-    ax.axhline(0.5, color=GRID, linewidth=0.8, zorder=0.5)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _draw_shuffled_band(ax: Axes, rows: pd.DataFrame) -> None:
-    if not len(rows) or rows.loc[:, "layer"].isna().any():
-        return
-    at = rows.groupby("layer").agg(mean=("value", "mean"), spread=("spread", "mean"))
-    low, high = at["mean"] - 2 * at["spread"], at["mean"] + 2 * at["spread"]
-    ax.fill_between(at.index.to_numpy(float), low, high, color=GRID, alpha=0.5, linewidth=0, zorder=0.2)
 
 
 def confabulated_strip(results: Results) -> Figure:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from traps_pipeline.mechanism.probes import auroc
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.regimes import GUIDED, RANDOM_WEIGHTS, STANDARD
 from traps_pipeline.report.result_frames import Results
-from traps_pipeline.report.tables.control_reports import prompts
-from traps_pipeline.report.tables.inside_columns import short_names, why_not
+from traps_pipeline.report.tables.control_reports import OTHER_GATES, leads, prompts
+from traps_pipeline.report.tables.inside_columns import why_not
 from traps_pipeline.report.tables.interaction_table import interaction_table
 from traps_pipeline.report.tables.table_columns import MODEL as MODEL_COLUMN
 from traps_pipeline.report.writing import Column, PrintedTable, fraction
@@ -25,12 +25,13 @@ from traps_pipeline.report.writing import Column, PrintedTable, fraction
 if TYPE_CHECKING:
     import pandas as pd
 
-PLACEBO, NO_GAP = "placebo", "no_gap"
+PLACEBO, RIVAL, NO_GAP = "placebo", "rival", "no_gap"
 RANDOM = (*RANDOM_WEIGHTS,)
-SUBJECTS = (MODEL, *RANDOM, PLACEBO, NO_GAP)
-SUBJECT_NAMES = dict(zip(SUBJECTS, ("model", "random 0", "random 1", "placebo", "pocket, no gap"), strict=True))
+SUBJECTS = (MODEL, *RANDOM, PLACEBO, RIVAL, NO_GAP)
+SUBJECT_NAMES = dict(
+    zip(SUBJECTS, ("model", "random 0", "random 1", "placebo", "best rival", "pocket, no gap"), strict=True)
+)
 NO_GAP_FILE = ASSETS / "pocket" / "no_gap" / "mechanism.csv"  # by `python -m tools.pocket card`
-OTHER_GATES = ("question words", "first frame", "all frames", "length", "time stamps", "output margin", LOGITS)
 VISUAL = tuple(name for name in DATASETS if not is_ill_posed(name))
 TEXTUAL = tuple(name for name in DATASETS if is_ill_posed(name))
 
@@ -44,7 +45,8 @@ class Claim:
     """A claim about a model's inside.
 
     figure: what is measured; it holds from `bound` on. of: the figure of a model and subject, None where the study has
-    none. fails_in: the controls in which the figure must stay below the bound.
+    none, NaN where the subject's states do not vary. fails_in: the controls in which the figure must stay below the
+    bound. instead: by subject, the words that stand in place of a figure that no study has.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Claim:
     bound: float
     of: Callable[[Results, str, str], float | None]
     fails_in: Sequence[str]
+    instead: Mapping[str, str] = field(default_factory=dict)
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
@@ -224,49 +227,56 @@ def _same_direction(results: Results, model: str) -> float | None:
 def _interaction(results: Results, model: str, subject: str) -> float | None:
     """Return the lower of AUROC and share within a clip, at the chosen layer with families held out."""
     rows = results.interaction
-    rows = rows.loc[(rows["model"] == model) & (rows["prompt"] == {MODEL: GUIDED}.get(subject, subject))]
-    rows = rows.loc[(rows["features"] == STATES) & (rows["held_out"] == "families") & rows["chosen"].eq(True)]
-    return _mean(rows[["auroc", "within"]].min(axis=1))
+    rows = rows.loc[(rows["model"] == model) & (rows["prompt"] == (subject if subject in RANDOM else GUIDED))]
+    rows = rows.loc[(rows["held_out"] == "families") & rows["chosen"].eq(True)]
+    rows = rows.loc[rows["features"].ne(STATES) if subject == RIVAL else rows["features"].eq(STATES)]
+    figures = rows[["auroc", "within"]].min(axis=1).where(rows["same"].ne(1) | rows["features"].ne(STATES))
+    return None if subject == PLACEBO or rows.empty else float(figures.max())
 
 
 _ALL, _GAP = (*RANDOM, PLACEBO, NO_GAP), (*RANDOM, PLACEBO)
+_SUBTRACTED = {RIVAL: "subtracted"}
+_TEXTS = {**_SUBTRACTED, PLACEBO: "same clip"}  # an ill-posed question is asked of the control's clip
+_PROBES = {RIVAL: "in leads", PLACEBO: "look-alikes"}
+_ANSWERS = {**dict.fromkeys(RANDOM, "not asked"), PLACEBO: "not asked", RIVAL: "no probe"}
 CLAIMS = (
-    Claim("interaction", "states tell that the asked event is hidden", "AUROC and share in a clip, the lower", 0.65,
-          _interaction, RANDOM),
+    Claim("interaction", "states tell, and rivals do not, that the asked event is hidden",
+          "AUROC and share in a clip, the lower", 0.65, _interaction, (*RANDOM, RIVAL), {PLACEBO: "same clip"}),
     Claim("lead_visual", "states tell visual voids better than all rivals", "AUROC, states − best rival", 0.1,
-          _by_features(_lead, VISUAL), _GAP),
+          _by_features(_lead, VISUAL), _GAP, _SUBTRACTED),
     Claim("lead_textual", "states tell ill-posed voids better than all rivals", "AUROC, states − best rival", 0.1,
-          _by_features(_lead, TEXTUAL), _GAP),
+          _by_features(_lead, TEXTUAL), _GAP, _TEXTS),
     Claim("residual", "states without words, pixels, length tell visual voids", "AUROC of residual states", 0.65,
-          _by_features(lambda results, target, areas: areas[RESIDUAL], VISUAL), _GAP),
+          _by_features(lambda results, target, areas: areas[RESIDUAL], VISUAL), _GAP, {RIVAL: "taken out"}),
     Claim("output", "states tell visual voids better than the output", "AUROC, states − best of the output", 0.1,
-          _by_features(_beyond_output, VISUAL), _ALL),
+          _by_features(_beyond_output, VISUAL), _ALL, _SUBTRACTED),
     Claim("sentence", "states tell voids better than a whole abstention", "AUROC, states − sentence", 0.1, _sentences,
-          (NO_GAP,)),
+          (NO_GAP,), _ANSWERS | _SUBTRACTED),
     Claim("unexpressed", "voids are encoded and answered", "share of voids − of controls", 0.3, _unexpressed,
-          (NO_GAP,)),
+          (NO_GAP,), _ANSWERS),
     Claim("transfer_visual", "one probe carries over to visual voids", "AUROC at the chosen layer", 0.65,
-          _transfer(VISUAL), RANDOM),
+          _transfer(VISUAL), RANDOM, _PROBES),
     Claim("transfer_textual", "one probe carries over to ill-posed questions", "AUROC at the chosen layer", 0.65,
-          _transfer(TEXTUAL), RANDOM),
-    Claim("look_alikes", "voids differ from all that looks like them", "lowest AUROC", 0.65, _look_alikes, RANDOM),
+          _transfer(TEXTUAL), RANDOM, _PROBES),
+    Claim("look_alikes", "voids differ from all that looks like them", "lowest AUROC", 0.65, _look_alikes, RANDOM,
+          _PROBES | {PLACEBO: "included"}),
     Claim("gate", "a gate on states beats all other gates", "PECS, states − best other", 0.05, _gate,
-          (*RANDOM, NO_GAP)),
+          (*RANDOM, NO_GAP), {PLACEBO: "not asked"} | _SUBTRACTED),
     Claim("answers", "abstains on voids when told that it may", "AbsRec, guided − standard", 0.3,
-          _prompt(lambda rows: rows["change"]), (NO_GAP,)),
+          _prompt(lambda rows: rows["change"]), (NO_GAP,), _ANSWERS),
     Claim("lens", "the prompt decides what is said of voids", "guided moves voids, nats", 1.0, _of_own(_moved),
-          (NO_GAP,)),
+          (NO_GAP,), _ANSWERS),
     Claim("prompt", "the prompt changes the output’s order alone", "change of AUROC, margin − probe", 0.1,
           _prompt(lambda rows: rows["margin_guided"] - rows["margin_standard"]
-                  - (rows["probe_guided"] - rows["probe_standard"]).abs(), joins=False), (NO_GAP,)),
+                  - (rows["probe_guided"] - rows["probe_standard"]).abs(), joins=False), (NO_GAP,), _ANSWERS),
     Claim("differ", "output depends on the side (patching)", "share of pairs that differ in sign", 0.5,
-          _of_own(_differ), (NO_GAP,)),
+          _of_own(_differ), (NO_GAP,), _ANSWERS),
     Claim("direction", "one direction of the void under both prompts", "cosine standard, guided", 0.65,
-          _of_own(_same_direction), (NO_GAP,)),
+          _of_own(_same_direction), (NO_GAP,), _ANSWERS),
     Claim("followed", "answers follow what guided states hold alone", "controls, guided − standard directions", 0.3,
-          _of_own(_followed), (NO_GAP,)),
+          _of_own(_followed), (NO_GAP,), _ANSWERS),
     Claim("ahead", "guided directions do more than nulls", "controls, direction − highest null draw, largest α", 0.1,
-          _of_own(_ahead), ()),
+          _of_own(_ahead), (), _ANSWERS),
 )  # fmt: skip
 
 # --- verdicts ---------------------------------------------------------------------------------------------------------
@@ -281,27 +291,37 @@ def claim_frame(results: Results) -> pd.DataFrame:
     for model in dict.fromkeys(str(model) for table in tables for model in table["model"]):
         for claim in CLAIMS:
             values, note = {NO_GAP: without_gap.get(claim.name)}, ""
-            for subject in (MODEL, *RANDOM, PLACEBO):
+            for subject in (MODEL, *RANDOM, PLACEBO, RIVAL):
                 try:
                     values[subject] = claim.of(results, model, subject)
                 except TwoModels as joined:
                     values[subject], note = None, f"two models ({joined})"
             figures = {f"in_{subject}": value for subject, value in values.items()}
-            rows.append({"model": model, "claim": claim.name, **figures, "verdict": note or verdict(claim, values)})
-    columns = ["model", "claim", *(f"in_{subject}" for subject in SUBJECTS), "verdict"]
-    return pd.DataFrame(rows, columns=pd.Index(columns))
+            words = {f"why_{subject}": _absence(claim, subject, value) for subject, value in values.items()}
+            row = {"model": model, "claim": claim.name, **figures, **words}
+            rows.append(row | {"verdict": note or verdict(claim, values)})
+    fields = (f"{kind}_{subject}" for kind in ("in", "why") for subject in SUBJECTS)
+    return pd.DataFrame(rows, columns=pd.Index(["model", "claim", *fields, "verdict"]))
+
+
+def _absence(claim: Claim, subject: str, value: float | None) -> str:
+    """Return why a subject has no figure of a claim, in words for a cell; empty if it has one."""
+    if value is None:
+        return claim.instead.get(subject, "not run")
+    return "" if value == value else "constant"
 
 
 def verdict(claim: Claim, values: Mapping[str, float | None]) -> str:
     """Return whether a claim is held, and if not, why."""
-    own = values.get(MODEL)
+    known = {name: value for name, value in values.items() if value is not None and value == value}
+    own = known.get(MODEL)
     if own is None or own < claim.bound:
         return "not measured" if own is None else "does not hold"
-    controls = {name: value for name in claim.fails_in if (value := values.get(name)) is not None}
+    controls = {name: known[name] for name in claim.fails_in if name in known}
     failing = [SUBJECT_NAMES[name] for name, value in controls.items() if value >= claim.bound]
     if failing:
         return f"holds in {', '.join(failing)} too"
-    return "holds" if controls or not claim.fails_in else "no control"
+    return "holds" if {*controls} - {RIVAL} or not claim.fails_in else "no control"
 
 
 def no_gap_figures() -> dict[str, float]:
@@ -318,7 +338,7 @@ def no_gap_figures() -> dict[str, float]:
 
 def claims(results: Results) -> list[PrintedTable]:
     """Return each claim in the model and in its controls, then what states and rivals tell."""
-    return [_claims(results), interaction_table(results), _leads(results)]
+    return [_claims(results), interaction_table(results), leads(results)]
 
 
 def _claims(results: Results) -> PrintedTable:
@@ -327,16 +347,20 @@ def _claims(results: Results) -> PrintedTable:
     rows = rows.assign(
         says=[by_name[name].says for name in rows["claim"]],
         figure=[f"{by_name[name].figure} ≥ {by_name[name].bound:g}" for name in rows["claim"]],
-    )
+        **{f"cell_{name}": claim_cells(rows, name) for name in SUBJECTS},
+    ).drop(columns=[f"why_{name}" for name in SUBJECTS])
     columns = [
         MODEL_COLUMN, Column("says", "Claim"), Column("figure", "Holds if"),
-        *(Column(f"in_{name}", SUBJECT_NAMES[name], "fraction") for name in SUBJECTS), Column("verdict", "Verdict"),
+        *(Column(f"cell_{name}", SUBJECT_NAMES[name], "range") for name in SUBJECTS), Column("verdict", "Verdict"),
     ]  # fmt: skip
     notes = [
         "a claim holds if its figure reaches the bound in the model and in none of the controls that it must fail in; "
         "others are shown and do not count",
-        "random: the same network with random weights, two seeds; placebo: answerable items in the place of voids, the "
-        "largest figure; pocket, no gap: a model that says all that it encodes, the largest figure of its seeds",
+        "random: the same network with random weights, two seeds, under the same prompt; placebo: answerable items in "
+        "the place of voids, the largest figure; pocket, no gap: a model that says all that it encodes, the largest "
+        "figure of its seeds",
+        "words for figures: same clip, both questions are of one, so that no placebo differs; subtracted, the "
+        "figure is a difference from it; not asked, it gave no answers; constant, its states are one for all items",
         "probes are fitted on other datasets; rivals: words, pixels, length, time stamps, the output margin, and a "
         "probe on the logits of the first token",
     ]
@@ -344,41 +368,7 @@ def _claims(results: Results) -> PrintedTable:
     return PrintedTable("claims", "What is claimed, and in which controls it holds too", rows, columns, notes, reason)
 
 
-def lead_rows(results: Results) -> pd.DataFrame:
-    """Return a row by model, subject and target, with the AUROC of each kind of features."""
-    rows, keys = results.leads, ["model", "subject", "target"]
-    rows = rows.astype(dict.fromkeys((*keys, "features"), object))
-    own = rows.loc[rows["features"] == STATES, [*keys, "layer", "low", "high", "rival", "lead", "lead_low", "lead_high",
-                                                "n_voids", "n_controls"]]  # fmt: skip
-    areas = rows.pivot_table(index=keys, columns="features", values="auroc", observed=True).reset_index()
-    return own.merge(areas, on=keys, how="left")
-
-
-def _leads(results: Results) -> PrintedTable:
-    rows = lead_rows(results)
-    rows = rows.assign(dataset=short_names(rows["target"]))
-    rivals = [name for name in OTHER_GATES if name in rows]
-    columns = [
-        MODEL_COLUMN, Column("subject", "Subject"), Column("dataset", "Target"), Column("layer", "Layer", "count"),
-        Column(STATES, "States", "fraction"), Column("low", "from", "fraction"), Column("high", "to", "fraction"),
-        *(Column(name, name.capitalize(), "fraction") for name in (RESIDUAL, *rivals) if name in rows),
-        Column("rival", "Best rival"), Column("lead", "Lead", "fraction"), Column("lead_low", "from", "fraction"),
-        Column("lead_high", "to", "fraction"), Column("n_voids", "Voids", "count"),
-        Column("n_controls", "Controls", "count"),
-    ]  # fmt: skip
-    gates = results.gate
-    gates = gates.loc[
-        (gates["source"] == "other datasets") & (gates["threshold"] == "mid") & (gates["target"] == "all")
-    ]
-    notes = ["AUROC of voids against controls, by probes of the other datasets that have not seen the scenario"]
-    for (model, regime), part in gates.groupby(["model", "regime"], observed=True, sort=False):
-        figures = ", ".join(
-            f"{name} {fraction(value)}" for name, value in zip(part["features"], part["pecs"], strict=True)
-        )
-        notes.append(
-            f"{model} under {regime}, PECS {fraction(part['plain_pecs'].iloc[0])} without a gate; gated on {figures}"
-        )
-    reason = why_not(results, "the paper has no such rivals")
-    return PrintedTable(
-        "leads", "States and their rivals, in the model and in its controls", rows, columns, notes, reason
-    )
+def claim_cells(rows: pd.DataFrame, subject: str) -> list[str]:
+    """Return a subject's printed figures, or the words that stand in their place."""
+    figures = zip(rows[f"in_{subject}"], rows[f"why_{subject}"], strict=True)
+    return [why or fraction(value) for value, why in figures]

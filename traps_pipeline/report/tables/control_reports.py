@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from traps_pipeline.mechanism.control_rows import LOGITS, RESIDUAL, STATES
 from traps_pipeline.protocol.datasets import DATASETS, SHORT
 from traps_pipeline.protocol.regimes import PROMPTING
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import (
     DIRECTIONS,
-    DRAWS,
     INFERENCE,
     LAYER,
     PATH,
     SIDES,
-    best_baselines,
     few_marks,
     few_note,
     interval,
@@ -60,21 +59,10 @@ def _nulls(results: Results) -> PrintedTable:
         "effect: more abstention on controls (+), less on voids (−), against the unsteered answers of the same items",
         "nulls are orthogonal to the void direction and have its length; p = (1 + draws at least as large) / "
         "(1 + draws), one-sided, not corrected for the number of rows",
-        *_extent_beyond_nulls(rows),
         *few_note(table_rows),
     ]
     reason = why_not(results, "the paper has no such nulls")
     return PrintedTable("steering_nulls", "Void directions among their nulls", table_rows, columns, notes, reason)
-
-
-def _extent_beyond_nulls(rows: pd.DataFrame) -> list[str]:
-    """Return where the void direction exceeds at least 95 % of its nulls, in words."""
-    targets = rows.loc[rows["target"] != "all"]
-    if targets.empty:
-        return []
-    count = int((20 * targets["n_at_least"] <= targets["draws"]).sum())
-    extent = f"in {count} of {len(targets)} rows" if count else "nowhere"
-    return [f"the void direction is ahead of 19 of 20 draws {extent}; one row in ten would be so by chance"]
 
 
 MODEL_OF = ("model", "directions", "regime")
@@ -119,11 +107,6 @@ DEFAULT_GATE = {"source": "other datasets", "threshold": "mid"}
 SOURCE_NAMES = {f"one:{name}": short for name, short in SHORT.items()}
 
 
-def gate(results: Results) -> list[PrintedTable]:
-    """Return PECS before and after gates and prompts, by source, threshold, features."""
-    return [_gate_sources(results), _prompts(results)]
-
-
 _GATED = (
     Column("plain_pecs", "PECS, plain", "fraction"), Column("pecs", "PECS, gated", "fraction", mark="mark"),
     *interval("pecs_"),
@@ -138,26 +121,23 @@ _GATE_NOTES = (
 )
 
 
-def _gates(results: Results) -> pd.DataFrame:
-    """Return gate rows; states, other datasets, mid threshold, all datasets first."""
+def gate(results: Results) -> list[PrintedTable]:
+    """Return PECS before and after gates by source and threshold on states, and of all features by the default gate."""
     rows = results.gate
-    first_values = {"features": "states", **DEFAULT_GATE, "target": "all"}
+    first_values = {"features": STATES, **DEFAULT_GATE, "target": "all"}
     is_later = {f"{name}_later": rows[name].astype(object) != first for name, first in first_values.items()}
     rows = rows.assign(**is_later).sort_values(["model", "regime", *is_later], kind="stable", ignore_index=True)
-    return rows.assign(
+    is_default = ~rows[[f"{name}_later" for name in first_values if name != "features"]].any(axis=1)
+    rows = rows.loc[is_default | (rows["features"] == STATES) & rows["target"].isin([*SHORT, "all"])]
+    rows = rows.assign(
         mark=few_marks(rows, "n_controls", "n_voids"),
         layer=rows["layer"].where(rows["layer"] >= 0),  # a mean over datasets has no layer of its own
         dataset=short_names(rows["target"]),
         sources=[SOURCE_NAMES.get(name, name) for name in rows["source"]],
     ).drop(columns=[*is_later])
-
-
-def _gate_sources(results: Results) -> PrintedTable:
-    rows = _gates(results)
-    rows = rows.loc[(rows["features"] == "states") & rows["target"].isin([*SHORT, "all"])]
     columns = [
-        MODEL, Column("regime", "Answers"), Column("sources", "Gate from"), Column("threshold", "Threshold"),
-        Column("dataset", "Target"), LAYER, *_GATED,
+        MODEL, Column("regime", "Answers"), Column("features", "Gate on"), Column("sources", "Gate from"),
+        Column("threshold", "Threshold"), Column("dataset", "Target"), LAYER, *_GATED,
     ]  # fmt: skip
     notes = [
         *_GATE_NOTES,
@@ -167,66 +147,64 @@ def _gate_sources(results: Results) -> PrintedTable:
         *few_note(rows),
     ]
     reason = why_not(results, "the paper gates nothing")
-    return PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, reason)
+    return [PrintedTable("gate", "Probe-gated abstention", rows, columns, notes, reason)]
 
 
 def prompts(results: Results) -> pd.DataFrame:
-    """Return AbsRec (shares) under standard and guided, by model and dataset.
+    """Return what a prompt changes by model and dataset: `change`, AbsRec (shares) under guided less standard.
 
-    Also, for both prompts, the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario)
-    and of the output margin; those of the best raw input and of noise; n_answered, the fewest voids answered under
-    either prompt, n_voids and n_controls of the probe.
+    Also, under both prompts, the AUROC of the probe (at the dataset's chosen layer, fitted without the scored scenario)
+    and of the output margin.
     """
     import pandas as pd
 
     keys = ["model", "dataset"]
     gate_rows = results.gate.loc[results.gate["target"].isin(DATASETS)].rename(columns={"target": "dataset"})
     gate_rows = gate_rows.astype({"regime": object, "dataset": object})
-    table = gate_rows.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
-    table = table.reindex(columns=pd.Index(PROMPTING)).add_prefix("said_")
-    table["change"] = table["said_guided"] - table["said_standard"]
-    count_columns = {"n_answered": (gate_rows, "n_voids")}
-    prompt_probes = [results.prompted_probes.loc[results.prompted_probes["chosen"].eq(True)]]
-    prompt_probes += [results.prompted_baselines.loc[results.prompted_baselines["features"] == "output margin"]]
-    for name, rows in zip(("probe", "margin"), prompt_probes, strict=True):
-        rows = rows.loc[(rows["analysis"] == "held_out") & (rows["source"] == rows["target"])]
-        rows = rows.rename(columns={"target": "dataset"}).astype({"prompt": object, "dataset": object})
-        by_prompt = rows.pivot_table(index=keys, columns="prompt", values="value", observed=True)
+    shares = gate_rows.pivot_table(index=keys, columns="regime", values="plain_abs_rec", observed=True)
+    shares = shares.reindex(columns=pd.Index(PROMPTING))
+    table = (shares["guided"] - shares["standard"]).to_frame("change")
+    probes = results.prompted_probes.loc[results.prompted_probes["chosen"].eq(True)]
+    probes = probes.loc[(probes["analysis"] == "held_out") & (probes["source"] == probes["target"])]
+    probes = probes.rename(columns={"target": "dataset", "value": "auroc"})
+    margins = results.lens.loc[results.lens["layer"] == results.lens.groupby("model")["layer"].transform("max")]
+    for name, rows in (("probe", probes), ("margin", margins)):
+        rows = rows.astype({"prompt": object, "dataset": object, "auroc": float})
+        by_prompt = rows.pivot_table(index=keys, columns="prompt", values="auroc", observed=True)
         table = table.join(by_prompt.reindex(columns=pd.Index(PROMPTING)).add_prefix(f"{name}_"))
-        if name == "probe":
-            count_columns |= {count: (rows, count) for count in ("n_voids", "n_controls")}
-    for name, (rows, count) in count_columns.items():
-        table[name] = rows.groupby(keys)[count].min().reindex(table.index)
-    floor = best_baselines(results, "held_out").reset_index()
-    floor = floor.loc[floor["source"] == floor["target"]].rename(columns={"target": "dataset"})
-    return table.reset_index().merge(floor[[*keys, "raw", "raw_value", "noise", "noise_spread"]], on=keys, how="left")
+    return table.reset_index()
 
 
-def _prompts(results: Results) -> PrintedTable:
-    rows = prompts(results)
-    rows = rows.assign(
-        name=short_names(rows["dataset"]),
-        said_mark=few_marks(rows, "n_answered"),
-        probe_mark=few_marks(rows, "n_voids", "n_controls"),
-    )
+# --- rivals -----------------------------------------------------------------------------------------------------------
+
+OTHER_GATES = ("question words", "first frame", "all frames", "length", "time stamps", "output margin", LOGITS)
+
+
+def lead_rows(results: Results) -> pd.DataFrame:
+    """Return a row by model, subject and target, with the AUROC of each kind of features."""
+    rows, keys = results.leads, ["model", "subject", "target"]
+    rows = rows.astype(dict.fromkeys((*keys, "features"), object))
+    own = rows.loc[rows["features"] == STATES, [*keys, "layer", "low", "high", "rival", "lead", "lead_low", "lead_high",
+                                                "n_voids", "n_controls"]]  # fmt: skip
+    areas = rows.pivot_table(index=keys, columns="features", values="auroc", observed=True).reset_index()
+    return own.merge(areas, on=keys, how="left")
+
+
+def leads(results: Results) -> PrintedTable:
+    """Return what states and rivals tell of each dataset, in the model and in its controls."""
+    rows = lead_rows(results)
+    rows = rows.assign(dataset=short_names(rows["target"]))
+    rivals = [name for name in OTHER_GATES if name in rows]
     columns = [
-        MODEL, Column("name", "Dataset"), Column("said_standard", "AbsRec %, standard", "percent", mark="said_mark"),
-        Column("said_guided", "guided", "percent", mark="said_mark"),
-        Column("change", "guided − standard", "percent", mark="said_mark"),
-        *(Column(f"{kind}_{prompt}", f"{label}, {prompt}", "fraction", mark="probe_mark")
-          for kind, label in (("probe", "Probe"), ("margin", "Output margin")) for prompt in PROMPTING),
-        Column("raw", "Best raw input"), Column("raw_value", "its AUROC", "fraction"),
-        Column("noise", "Noise", "fraction", spread="noise_spread"),
-        Column("n_answered", "Voids answered about", "count"), *SIDES,
+        MODEL, Column("subject", "Subject"), Column("dataset", "Target"), Column("layer", "Layer", "count"),
+        Column(STATES, "States", "fraction"), Column("low", "from", "fraction"), Column("high", "to", "fraction"),
+        *(Column(name, name.capitalize(), "fraction") for name in (RESIDUAL, *rivals) if name in rows),
+        Column("rival", "Best rival"), Column("lead", "Lead", "fraction"), Column("lead_low", "from", "fraction"),
+        Column("lead_high", "to", "fraction"), Column("n_voids", "Voids", "count"),
+        Column("n_controls", "Controls", "count"),
     ]  # fmt: skip
-    notes = [
-        "what the prompt changes: the answers (AbsRec), or what is represented (AUROC of voids against controls, "
-        "states under the VQA prompt of that name, fitted without the scored scenario); the best raw input and noise "
-        "are the same under both prompts",
-        "output margin: log-odds that the first answer token begins an abstention; noise: random vectors as wide as "
-        "states, mean ± deviation over draws, the floor of the split",
-        *few_note(rows, "said_mark", "probe_mark"),
-    ]
-    reason = why_not(results, "the paper prints no such numbers")
-    title = "What the prompt changes, in answers and in states"
-    return PrintedTable("prompt_gate", title, rows, columns, notes, reason, deviation=DRAWS)
+    notes = ["AUROC of voids against controls, by probes of the other datasets that have not seen the scenario"]
+    reason = why_not(results, "the paper has no such rivals")
+    return PrintedTable(
+        "leads", "States and their rivals, in the model and in its controls", rows, columns, notes, reason
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from traps_pipeline.mechanism.control_rows import STATES
+from traps_pipeline.protocol.regimes import RANDOM_WEIGHTS
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.inside_columns import why_not
 from traps_pipeline.report.tables.table_columns import MODEL
@@ -20,7 +21,8 @@ _COLUMNS = (
 _NOTES = (
     "of clips that hide one of two events, under both questions: AUROC of a probe for “the asked event is hidden”; "
     "within a clip: share whose hidden event’s question is scored above the other one; at the chosen layer",
-    "confound: the same probe over all eight items, where the number of boards tells; it claims nothing",
+    "confound: the same probe over all eight items, where the number of boards tells; it claims nothing; raw inputs "
+    "are at .5 by design, margin and logits are the output",
     "own and other effect of hiding: in scores, in their standard deviations; in answers, shares that abstain",
 )
 
@@ -29,6 +31,8 @@ def interaction_table(results: Results) -> PrintedTable:
     """Return INTERACTION at the chosen layers, states with the answers of the same model beside them."""
     rows = results.interaction
     rows = rows.loc[rows["chosen"].eq(True)].astype({"model": object, "prompt": object})
+    rows = rows.loc[rows["features"].eq(STATES) | ~rows["prompt"].isin(RANDOM_WEIGHTS)]  # rivals are the same there
+    rows = rows.assign(layer=rows["layer"].where(rows["layer"] >= 0))
     effects = {"regime": "prompt", "own_effect": "answers_own", "other_effect": "answers_other"}
     answers = results.two_way.rename(columns=effects)[["model", *effects.values()]].astype({"model": object})
     rows = rows.merge(answers, on=["model", "prompt"], how="left")

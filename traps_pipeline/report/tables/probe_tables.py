@@ -16,7 +16,6 @@ from traps_pipeline.report.tables.inside_columns import (
     KEYS,
     LAYER,
     PATH,
-    SHORTCUTS,
     SIDES,
     TYPE,
     baseline_columns,
@@ -32,8 +31,6 @@ from traps_pipeline.report.tables.table_columns import MODEL
 from traps_pipeline.report.writing import Column, PrintedTable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import pandas as pd
 
 
@@ -278,32 +275,21 @@ def _catch(results: Results) -> PrintedTable:
     controls = rows.loc[rows["analysis"] == "centroid_control"].groupby(keys, sort=False)
     alarms = controls.agg(false_alarm=("value", "mean"), n_controls=("n_controls", "max"))
     table = table.join(alarms).reset_index()
-    table = table.merge(_caught_beside(results), on=["model", "target", "sub_scenario"], how="left")
     table = table.assign(dataset=short_names(table["target"]), mark=few_marks(table, "n", "n_controls"))
     columns = [
         MODEL, Column("dataset", "Target"), Column("sub_scenario", "Sub-scenario"), LAYER,
         Column("rate", "Catch rate %", "percent", mark="mark"), Column("lowest", "lowest", "percent"),
         Column("highest", "highest", "percent"), Column("false_alarm", "Controls %", "percent"),
-        *(_caught_columns() if results.is_study else ()), Column("n", "n", "count"),
+        Column("n", "n", "count"),
     ]  # fmt: skip
     notes = ["voids that the source’s nearest centroid assigns to void, mean over the other datasets as sources"]
     if results.is_study:
         notes += [
             "one source of each target is the other dataset of its taxonomy, which has the same controls: these shares "
-            "of controls are too low, and those of noise beside them show by how much",
-            "best raw input: the one whose catch rate is farthest above its share of controls; controls % to the right "
-            "of a baseline are its own",
+            "of controls are too low",
         ]
     notes += few_note(table)
     return PrintedTable("probe_catch_rates", "Nearest centroid: catch rates", table, columns, notes, why_not(results))
-
-
-def _caught_columns() -> Iterator[Column]:
-    """Yield each baseline's columns: the assigned share of look-alikes and controls."""
-    yield Column("raw", "Best raw input")
-    for name, heading in (("raw", "catches %"), ("margin", "Output margin %"), ("noise", "Noise %")):
-        yield Column(f"{name}_void", heading, "percent")
-        yield Column(f"{name}_control", "its controls %", "percent")
 
 
 def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
@@ -311,29 +297,3 @@ def _centroids(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows.loc[rows["analysis"].isin(["centroid_void", "centroid_control"]) & (rows["scope"] != "all")]
     names = rows["scope"].astype(object).str.removeprefix("sub_scenario:")
     return rows.assign(sub_scenario=names, target=rows["target"].astype(object).fillna(""))
-
-
-def _caught_beside(results: Results) -> pd.DataFrame:
-    """Return shares that baselines assign to void, by model, target, sub-scenario.
-
-    Baselines are the best raw input, the output margin and noise; shares, also of controls, are means over sources.
-    """
-    import pandas as pd
-
-    keys = ["model", "target", "sub_scenario"]
-    rows = _centroids(results.baselines).astype(dict.fromkeys(("model", "features", "analysis"), object))
-    by_analysis = rows.pivot_table(index=[*keys, "features"], columns="analysis", values="value", observed=True)
-    by_analysis = by_analysis.reindex(columns=pd.Index(["centroid_void", "centroid_control"])).reset_index()
-    by_analysis.columns = pd.Index([*keys, "features", "void", "control"])
-    order = by_analysis.assign(above=by_analysis["void"] - by_analysis["control"]).sort_values(
-        "above", ascending=False, kind="stable"
-    )
-    raw = order.loc[order["features"].isin(SHORTCUTS)].drop_duplicates(keys).set_index(keys)
-    table = raw[["features"]].rename(columns={"features": "raw"})
-    kinds = {"raw": raw} | {
-        name: by_analysis.loc[by_analysis["features"] == features].set_index(keys)
-        for name, features in (("margin", "output margin"), ("noise", "noise"))
-    }
-    for name, part in kinds.items():
-        table = table.join(part[["void", "control"]].add_prefix(f"{name}_"), how="outer")
-    return table.reset_index()

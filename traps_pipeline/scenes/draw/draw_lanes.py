@@ -79,6 +79,54 @@ def draw_two_events(
 
 
 def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, difficulty: Difficulty) -> DrawnLanes:
+    (world, *twins), wording = draw_worlds(family, number, rng, seed, difficulty)
+    evidence = certify_lanes(world, twins)
+    records = [
+        LaneRecord(
+            params=json_values(params_to_dict(world.events[k].params)),
+            lane=lane,
+            layout=world.layouts[k],
+            ground_truth=world.outcome(k).answer,
+            twin=LaneTwin(
+                params=json_values(params_to_dict(twins[k].events[k].params)),
+                ground_truth=twins[k].outcome(k).answer,
+                trajectory_sha256=trajectory_digest(twins[k].qpos),
+            ),
+        )
+        for k, lane in enumerate(world.lanes)
+    ]
+    spec = TwoEventsSpec(
+        scenario_id=_id(family.name, number),
+        category=family.category,
+        family=family.name,
+        seed=seed,
+        physics=physics_record(world.physics),
+        camera=json_values(asdict(world.camera)),
+        look=json_values(asdict(world.look)),
+        lanes=(records[0], records[1]),
+        question=wording.question,
+        labels=list(wording.labels),
+        aliases=dict(wording.aliases),
+        answer_type=family.answer_type,
+        trajectory_sha256=trajectory_digest(world.qpos),
+        evidence=json_values(evidence),
+    )
+    return DrawnLanes(spec, {"qpos": world.qpos, "left": twins[0].qpos, "right": twins[1].qpos})
+
+
+def draw_worlds(
+    family: Family,
+    number: int,
+    rng: np.random.Generator,
+    seed: int,
+    difficulty: Difficulty = DEFAULT_DIFFICULTY,
+    *,
+    is_alike: bool = True,
+) -> tuple[tuple[TwoLanes, TwoLanes, TwoLanes], Wording]:
+    """Return a world, those with the left and the right lane's twin, and the words for both. Raises Rejected.
+
+    Nothing is certified. is_alike: doubles have about as many pixels as the things, which are drawn for it.
+    """
     first = _event(family, rng, None, difficulty)
     pairs = [first, _event(family, rng, first[0].params, difficulty)][:: 1 if rng.integers(2) else -1]
     wording, look = _wording(pairs, int(rng.integers(2**31))), draw_look(rng, LOOKS)
@@ -92,43 +140,10 @@ def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, 
     above = [bool(number & 1), bool((number + 1 ^ number >> 1) & 1)]  # each arrangement once in four scenarios
     strips = _strips(wording, pairs, rng)
     lanes = [_lane(pair, strip, up, rng) for pair, strip, up in zip(pairs, strips, above, strict=True)]
-    events = [event for event, _ in pairs]
-    sizes = _sizes(_worlds(lanes, pairs, look))
+    sizes = _sizes(_worlds(lanes, pairs, look)) if is_alike else [uniform(rng, *SIZES) for _ in LANES]
     lanes = [replace(lane, size=size * uniform(rng, *ALIKE)) for lane, size in zip(lanes, sizes, strict=True)]
     lanes = [replace(lane, size=round(float(np.clip(lane.size, *SIZES)), 3)) for lane in lanes]
-    world, *twins = _worlds(lanes, pairs, look)
-    evidence = certify_lanes(world, twins)
-    records = [
-        LaneRecord(
-            params=json_values(params_to_dict(events[k].params)),
-            lane=lane,
-            layout=world.layouts[k],
-            ground_truth=world.outcome(k).answer,
-            twin=LaneTwin(
-                params=json_values(params_to_dict(twins[k].events[k].params)),
-                ground_truth=twins[k].outcome(k).answer,
-                trajectory_sha256=trajectory_digest(twins[k].qpos),
-            ),
-        )
-        for k, lane in enumerate(lanes)
-    ]
-    spec = TwoEventsSpec(
-        scenario_id=_id(family.name, number),
-        category=family.category,
-        family=family.name,
-        seed=seed,
-        physics=physics_record(world.physics),
-        camera=json_values(asdict(world.camera)),
-        look=json_values(asdict(look)),
-        lanes=(records[0], records[1]),
-        question=wording.question,
-        labels=list(wording.labels),
-        aliases=dict(wording.aliases),
-        answer_type=family.answer_type,
-        trajectory_sha256=trajectory_digest(world.qpos),
-        evidence=json_values(evidence),
-    )
-    return DrawnLanes(spec, {"qpos": world.qpos, "left": twins[0].qpos, "right": twins[1].qpos})
+    return _worlds(lanes, pairs, look), wording
 
 
 Pair = tuple[LaneEvent, LaneEvent]  # a lane's event and its twin

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.base.digests import digest
-from traps_pipeline.protocol.two_events import LANES, LaneItem, lane_items
+from traps_pipeline.protocol.two_events import CLIPS, LANES, LaneItem, lane_items
 from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.parts.look import Look
 from traps_pipeline.scenes.parts.wording import lane_question
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.picture.camera import WideCamera
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
 from traps_pipeline.scenes.worlds.lane_layout import Lane, Layout
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
-from traps_pipeline.scenes.worlds.spec import Slug, check_camera_and_physics
+from traps_pipeline.scenes.worlds.spec import Footage, Slug, check_camera_and_physics, check_labels, checked
 
 
 class _Record(BaseModel):
@@ -67,7 +67,8 @@ class TwoEventsSpec(_Record):
         check_camera_and_physics(self.camera, self.physics)
         for record in self.lanes:
             answers = {record.ground_truth, record.twin.ground_truth}
-            if len(answers) < 2 or not answers <= {*self.labels}:
+            check_labels(self.labels, self.aliases, answers)
+            if len(answers) < 2:
                 raise ValueError(f"ground truths {sorted(answers)}: a lane and its twin have two of {self.labels}")
         if self.lanes[0].lane.strip == self.lanes[1].lane.strip:
             raise ValueError(f"both lanes have a {self.lanes[0].lane.strip} strip, so no question names one")
@@ -101,8 +102,47 @@ class TwoEventsSpec(_Record):
         """Yield the eight items' questions, four of which can be answered."""
         for item in lane_items(self.scenario_id):
             record = self.lanes[LANES.index(item.lane)]
-            text = lane_question(record.lane.strip, self.question)
-            yield LaneQuestion(item, text, record.ground_truth)
+            yield LaneQuestion(item, _asked(self.question, record), record.ground_truth)
+
+
+class RecordedLane(_Record):
+    """One of two recorded events: its name in the question, its answer, and between which frames a board stands.
+
+    cover: the board (px): x, y, width, height. hides: where the event is hidden; stands: where it is seen, maybe never.
+    """
+
+    name: str
+    ground_truth: str
+    cover: list[int] = Field(min_length=4, max_length=4)
+    hides: list[tuple[int, int]]
+    stands: list[tuple[int, int]]
+
+
+class RecordedEvents(TwoEventsSpec):
+    """Two events of a recording, which nobody simulated (docs/recorded.md).
+
+    kind: the table's category. clips: their digests. question: of both events; {} stands for the name of one.
+    """
+
+    seed: int = 0
+    camera: dict[str, Any] = {}
+    look: dict[str, Any] = {}
+    kind: str
+    clips: dict[str, str]
+    lanes: tuple[RecordedLane, RecordedLane]  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @model_validator(mode="after")
+    def _parts_agree(self) -> RecordedEvents:
+        check_labels(self.labels, self.aliases, [lane.ground_truth for lane in self.lanes])
+        checked(Footage, "physics", self.physics)
+        if "{}" not in self.question or {*self.clips} != {*CLIPS}:
+            raise ValueError(f"question: needs {{}} for the name of an event, and clips: each of {', '.join(CLIPS)}")
+        return self
+
+
+def _asked(question: str, record: LaneRecord | RecordedLane) -> str:
+    is_recorded = isinstance(record, RecordedLane)
+    return question.replace("{}", record.name) if is_recorded else lane_question(record.lane.strip, question)
 
 
 @dataclass(frozen=True)

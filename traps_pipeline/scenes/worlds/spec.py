@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from traps_pipeline.base.digests import digest
 from traps_pipeline.base.files import replace_file
+from traps_pipeline.base.suggestions import did_you_mean
 from traps_pipeline.protocol.datasets import RECORDED
 
 if TYPE_CHECKING:
@@ -31,14 +32,14 @@ Length = Annotated[float, Field(ge=-100, le=100)]  # metres; a scene is a few me
 Angle = Annotated[float, Field(ge=-720, le=720)]  # degrees
 
 
-class _Footage(_Strict):
+class Footage(_Strict):
     """What a record says of its clips' length."""
 
     duration_s: float = Field(ge=1, le=60)
     fps: int = Field(ge=1, le=60)
 
 
-class _Physics(_Footage):
+class _Physics(Footage):
     """`kit.Physics` in a record."""
 
     timestep_s: float = Field(ge=1e-5, le=0.02)
@@ -104,6 +105,17 @@ class _RecordedVoid(_Strict):
     cover: list[int] | None = Field(default=None, min_length=4, max_length=4, description="x, y, width, height")
 
 
+def check_labels(labels: Sequence[str], aliases: Mapping[str, str], answers: Iterable[str]) -> None:
+    """Raise ValueError for a label that occurs twice, and for an answer or an alias of none of them."""
+    if len(set(labels)) != len(labels):
+        raise ValueError(f"labels {labels} repeat")
+    for answer in answers:
+        if answer not in labels:
+            raise ValueError(f"answer {answer!r} is not one of {labels}{did_you_mean(answer, labels)}")
+    if unknown_labels := sorted({*aliases.values()} - {*labels}):
+        raise ValueError(f"aliases point to unknown labels {unknown_labels}; labels are {labels}")
+
+
 class Answerable(BaseModel):
     """A question that both videos of the pair answer."""
 
@@ -165,13 +177,7 @@ class SceneSpec(BaseModel):
 
     @model_validator(mode="after")
     def _labels_agree(self) -> SceneSpec:
-        if self.ground_truth not in self.labels:
-            raise ValueError(f"ground_truth {self.ground_truth!r} is not one of the labels {self.labels}")
-        if len(set(self.labels)) != len(self.labels):
-            raise ValueError(f"labels {self.labels} repeat")
-        unknown_labels = sorted(set(self.aliases.values()) - set(self.labels))
-        if unknown_labels:
-            raise ValueError(f"aliases point to unknown labels {unknown_labels}; labels are {self.labels}")
+        check_labels(self.labels, self.aliases, [self.ground_truth])
         aside = self.answerable_question
         if aside is not None and aside.answer not in aside.labels:
             raise ValueError(f"answerable_question: answer {aside.answer!r} is not one of its labels")
@@ -187,17 +193,17 @@ class SceneSpec(BaseModel):
     @model_validator(mode="after")
     def _what_decides_the_pixels_is_plausible(self) -> SceneSpec:
         if self.is_recorded:
-            physics = _checked(_Footage, "physics", self.physics)
-            _checked(_Recording, "params", self.params)
+            physics = checked(Footage, "physics", self.physics)
+            checked(_Recording, "params", self.params)
         else:
             physics = check_camera_and_physics(self.camera, self.physics)
         hiding = _RecordedVoid if self.is_recorded else _Occluder
-        void = _checked(_Truncation if self.void_kind == "truncation" else hiding, "void", self.void)
+        void = checked(_Truncation if self.void_kind == "truncation" else hiding, "void", self.void)
         frame = void.cut_frame if isinstance(void, _Truncation) else void.hidden_from_frame
         frames = {"void": frame}
         if self.control is not None:
             kind = _ClosingOccluder if self.void_kind == "truncation" else _Closing
-            frames["control"] = _checked(kind, "control", self.control).closes_frame
+            frames["control"] = checked(kind, "control", self.control).closes_frame
         for name, at in frames.items():
             if at >= physics.duration_s * physics.fps:
                 raise ValueError(f"{name}: frame {at} is not in a clip of {physics.duration_s} s at {physics.fps} FPS")
@@ -234,7 +240,7 @@ def physics_record(physics: Physics) -> dict[str, Any]:
 _Part = TypeVar("_Part", bound=_Strict)
 
 
-def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
+def checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
     """Return a validated part of a record. Raises ValueError naming the field."""
     try:
         return kind.model_validate(values)
@@ -245,8 +251,8 @@ def _checked(kind: type[_Part], name: str, values: dict[str, Any]) -> _Part:
 
 def check_camera_and_physics(camera: dict[str, Any], physics: dict[str, Any]) -> _Physics:
     """Return a record's physics; raise ValueError for implausible values, naming the field."""
-    _checked(_Camera, "camera", camera)
-    return _checked(_Physics, "physics", physics)
+    checked(_Camera, "camera", camera)
+    return checked(_Physics, "physics", physics)
 
 
 def trajectory_digest(qpos: np.ndarray) -> str:

@@ -2,7 +2,8 @@
 
 const BOARDS = ["before the event", "before its bench"];
 
-// Clips for the player, with bars below; lane of `scene.lanes`: {name, stands: [from, until] in frames}.
+// Clips for the player, with bars below; lane of `scene.lanes`: {name, stands: [from, until] in frames}; of a recording
+// also `hides`, when its one board stands where the lane is hidden (`stands`: where it is seen).
 function laneClips(scene) {
   return scene.clips.map(({ name, path, hidden }) => ({
     title: clipName(name),
@@ -26,9 +27,9 @@ function clipName(name) {
 function boardBars({ lanes, n_frames: frames, fps }, hidden) {
   const share = (frame) => `${(100 * frame) / frames}%`;
   const now = h("span", { class: "now", style: { left: "0%" } });
-  const rows = lanes.flatMap(({ name, stands }, lane) =>
-    BOARDS.map((before, board) => {
-      const spans = hidden[lane] === (board === 0) ? [[0, frames]] : stands;
+  const rows = lanes.flatMap(({ name, stands, hides }, lane) =>
+    boardsOf(lanes).map((before, board) => {
+      const spans = hidden[lane] === (board === 0) ? (hides ?? [[0, frames]]) : stands;
       const words = spans
         .map(([from, until]) => `${(from / fps).toFixed(1)} to ${(until / fps).toFixed(1)} s`)
         .join(", ");
@@ -42,15 +43,19 @@ function boardBars({ lanes, n_frames: frames, fps }, hidden) {
   const names = lanes.map(({ name }) => h("span", null, name));
   const element = h(
     "div",
-    { class: "boards" },
+    { class: boardsOf(lanes).length > 1 ? "boards" : "boards one" },
     h("div", { class: "names", "aria-hidden": "true" }, names),
     h("div", { class: "tracks" }, rows, now),
   );
   return { element, show: (frame) => (now.style.left = share(Math.min(frame, frames - 1) + 0.5)) };
 }
 
-function boardKey() {
-  const each = BOARDS.map((before, board) =>
+function boardsOf([{ hides }]) {
+  return hides ? BOARDS.slice(0, 1) : BOARDS;
+}
+
+function boardKey({ lanes }) {
+  const each = boardsOf(lanes).map((before, board) =>
     h("li", null, h("span", { class: `part b${board}` }), `a board stands ${before}`),
   );
   return h("ul", { class: "key" }, each);
@@ -78,9 +83,10 @@ async function lanesView(route, info, found, scene) {
         "and each is asked about. ",
         link(["answers"], { dataset: LANES_DATASET, scenario }, "All answers to this scene"),
       ),
+      scene.certificate ? h("p", null, scene.certificate) : null,
       neighbourLinks(around, "scene"),
       unknownModels(info, route.parameters, ["model", "model2"]),
-      section(null, shown.element, boardKey()),
+      section(null, shown.element, boardKey(scene)),
       section(
         counted(items.length, "item"),
         h(

@@ -94,7 +94,8 @@ async function pairView(route) {
             h(
               "p",
               null,
-              "Why the control can be answered and the void cannot, computed from the simulation and not judged by eye:",
+              "Why the control can be answered and the void cannot, ",
+              scene.by_people ? "by the import and by people:" : "computed from the simulation and not judged by eye:",
             ),
             h(
               "ul",
