@@ -10,20 +10,11 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, ExceptionContext
 from sqlalchemy.event import listens_for
-from sqlalchemy.exc import OperationalError
 
 from traps_pipeline.base.databases import reason_and_remedy
+from traps_pipeline.base.errors import TrapsError
 
 _FILES = "history/runs.db", "history/runs/*.db"  # below DAGSTER_HOME
-
-
-class HistoryUnwritable(OperationalError):
-    """A full, failing or read-only disk, in our own words; Dagster stores the text."""
-
-    sentence = ""
-
-    def __str__(self) -> str:
-        return self.sentence
 
 
 def _is_history(engine: Engine) -> bool:
@@ -40,13 +31,10 @@ def _do_not_sync(connection: Connection) -> None:
 
 @listens_for(Engine, "handle_error")
 def _explain(context: ExceptionContext) -> None:
-    """Raise HistoryUnwritable in place of an error of a disk."""
+    """Raise TrapsError in place of an error of a disk: Dagster stores the text."""
     reason, remedy, is_unwritable = reason_and_remedy(context.original_exception)
-    if context.engine is None or not is_unwritable or not _is_history(context.engine):
-        return
-    unwritable = HistoryUnwritable(None, None, context.original_exception)
-    unwritable.sentence = (
-        f"{context.engine.url.database}: Dagster's history could not be written ({reason}); {remedy} and run the same "
-        "command again: tables are whole, no answer is lost"
-    )
-    raise unwritable
+    if context.engine is not None and is_unwritable and _is_history(context.engine):
+        raise TrapsError(
+            f"{context.engine.url.database}: Dagster's history could not be written ({reason}); {remedy} and run the "
+            "same command again: tables are whole, no answer is lost"
+        )

@@ -19,8 +19,8 @@ from typing_extensions import override
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.models.money.budget import BudgetReached
+from traps_pipeline.pipeline import history_files  # noqa: F401 - its listeners
 from traps_pipeline.pipeline.graph import Stage
-from traps_pipeline.pipeline.history_files import HistoryUnwritable
 from traps_pipeline.pipeline.ranges import Range, key_ranges
 from traps_pipeline.pipeline.translation import asset_key
 
@@ -29,7 +29,7 @@ PID_TAG, HOST_TAG = "traps/pid", "traps/host"
 # With Dagster's tag of a parent, its pages would call them re-executions.
 JOB_TAG, JOB_RUN_TAG = "traps/job", "traps/job_run"
 _RANGE = "dagster/asset_partition_range_start", "dagster/asset_partition_range_end"
-_SENTENCES = (TrapsError.__name__, BudgetReached.__name__, HistoryUnwritable.__name__)  # messages for people
+_SENTENCES = (TrapsError.__name__, BudgetReached.__name__)  # messages for people
 _INTERRUPTS = ("DagsterExecutionInterruptedError", "KeyboardInterrupt")
 _LOOK_S = 1.0  # between two looks whether a run was terminated in Dagster's pages
 _stopped_here = set[str]()  # runs that a signal to this process stops already
