@@ -9,7 +9,7 @@ import yaml
 from tests.conftest import EXPERIMENT, Checkout
 from traps_pipeline import inside
 from traps_pipeline.mechanism.control_rows import INTERACTION
-from traps_pipeline.mechanism.interaction import LaneDesign, figures_of
+from traps_pipeline.mechanism.interaction import LaneDesign, lane_metrics
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry.entries import get_model
@@ -24,7 +24,7 @@ CHANCE = pytest.approx({"auroc": 0.5, "within": 0.5, "own_effect": 0.0, "other_e
 
 
 def figures(features: np.ndarray, held_out: str = "families") -> dict[str, float]:
-    return figures_of(features, DESIGN, folds=3, resamples=200, seed=0)[held_out]
+    return lane_metrics(features, DESIGN, folds=3, resamples=200, seed=0)[held_out]
 
 
 @pytest.mark.parametrize("held_out", ["scenarios", "families"])
@@ -55,7 +55,7 @@ def test_what_clip_and_question_tell_apart_adds_up_to_chance_within_every_clip()
 def test_families_are_not_held_out_where_there_is_one() -> None:
     design = LaneDesign.of([item.item_id for n in range(4) for item in lane_items(f"chain-e00{n}")])
     features = design.asked[:, None].astype(float)
-    assert [*figures_of(features, design, folds=2, resamples=20, seed=0)] == ["scenarios"]
+    assert [*lane_metrics(features, design, folds=2, resamples=20, seed=0)] == ["scenarios"]
 
 
 @pytest.mark.slow

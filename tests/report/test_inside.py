@@ -37,7 +37,7 @@ def cells(table: PrintedTable) -> list[dict[str, str]]:
 
 
 def test_a_claim_is_held_only_where_no_control_that_must_fail_holds_too() -> None:
-    claim = Claim("x", "says", "figure", 0.1, lambda *_: None, ("random_0", "placebo"))
+    claim = Claim("x", "says", "metric", 0.1, lambda *_: None, ("random_0", "placebo"))
     for values, expected in (
         ({"model": 0.1, "random_0": 0.09, "placebo": 0.0, "random_1": 0.9}, "holds"),
         ({"model": 0.1, "random_0": 0.1, "placebo": 0.0}, "holds in random 0 too"),

@@ -8,7 +8,7 @@ from functools import partial
 import pandas as pd
 
 from traps_pipeline.protocol.datasets import DATASETS
-from traps_pipeline.report.printed_tables import COLUMNS, figures, titled_rows
+from traps_pipeline.report.printed_tables import COLUMNS, numbers, titled_rows
 from traps_pipeline.report.tables.table_columns import DATASET, MODEL, with_titles
 from traps_pipeline.report.terms import TITLE_OF
 from traps_pipeline.report.writing import Column
@@ -35,7 +35,7 @@ def _wide(rows: pd.DataFrame, kept: list[str], parts: Iterable[tuple[pd.DataFram
     columns = [COLUMNS[name] for name in kept]
     for part, field, name, heading in parts:
         table[name] = table[kept[-1]].map(part.set_index(kept[-1])[field])
-        columns += figures({name: heading})
+        columns += numbers({name: heading})
     return table, columns
 
 
@@ -50,7 +50,7 @@ def _overall() -> Arranged:
 
 
 def _cells(group: str) -> pd.DataFrame:
-    """Return the cells of a group's models, `figure ± spread` where both are printed."""
+    """Return the cells of a group's models, `number ± spread` where both are printed."""
     cells: pd.DataFrame = as_printed("behavioral_per_dataset")
     cells = cells.loc[cells["model"].isin(models_of(group=group))].copy()
     for field, spread in zip(SHARES, SPREADS, strict=True):
@@ -75,13 +75,13 @@ def _per_dataset() -> Arranged:
 
 def _expanded(dataset: str, regime: str) -> Arranged:
     names = {field: SHARES[field] for field in ("acc_pct", "false_abs_pct", "abs_rec_pct", "pecs")}
-    return _cells_of(_cells("main"), dataset, regime), [MODEL, *figures(names)]
+    return _cells_of(_cells("main"), dataset, regime), [MODEL, *numbers(names)]
 
 
 def _replication_per_dataset() -> Arranged:
     keys = [(m, d, r) for m in models_of(group="replication") for d in DATASETS for r in PRINTED_REGIMES]
     cells = _cells("replication").set_index(["model", "dataset", "regime"]).loc[keys].reset_index()
-    return with_titles(cells), [MODEL, DATASET, COLUMNS["regime"], *figures(SHARES)]
+    return with_titles(cells), [MODEL, DATASET, COLUMNS["regime"], *numbers(SHARES)]
 
 
 def _composition() -> Arranged:
@@ -89,7 +89,7 @@ def _composition() -> Arranged:
     rows["title"] = [f"{TITLE_OF[name]} (N = {SIZES[name]})" for name in rows["dataset"]]
     total = {"title": "Total", "label": "", "void_source": "", "n": "1,404", "question_type": ""}
     rows = pd.concat([rows, pd.DataFrame([total])], ignore_index=True)
-    columns = [DATASET, Column("label", "Sub-scenario"), Column("void_source", "Void source"), *figures({"n": "N"})]
+    columns = [DATASET, Column("label", "Sub-scenario"), Column("void_source", "Void source"), *numbers({"n": "N"})]
     return rows, [*columns, Column("question_type", "Question type")]
 
 
@@ -117,7 +117,7 @@ def _cosines() -> Arranged:
     order = [*dict.fromkeys(rows["source"])]
     rows["cosine"] = rows["cosine"].str.replace("-", "−")
     table_rows = rows.pivot(index="source", columns="other", values="cosine").loc[order].reset_index()
-    return table_rows, [Column("source", "Direction"), *figures({name: name for name in order})]
+    return table_rows, [Column("source", "Direction"), *numbers({name: name for name in order})]
 
 
 def _steering_regimes() -> Arranged:
@@ -131,7 +131,7 @@ def _steering_regimes() -> Arranged:
         rows.setdefault((first, second), {})[str(row["model"])] = " / ".join(sides)
     table = pd.DataFrame([{"directions": d, "inference": i, **cells} for (d, i), cells in rows.items()])
     names = {model: f"{model} ({layer})" for model, layer in STEERED.items()}
-    return table, [Column("directions", "Dir."), Column("inference", "Inf."), *figures(names)]
+    return table, [Column("directions", "Dir."), Column("inference", "Inf."), *numbers(names)]
 
 
 def _dose(family: str) -> Arranged:

@@ -12,7 +12,7 @@ from tools.pocket.lanes import LaneScenes
 from tools.pocket.seeds import SeedRow
 from tools.pocket.words import prompt_text
 from traps_pipeline.judging.rules import ABSTENTION, read_statement
-from traps_pipeline.mechanism.interaction import LaneDesign, figures_of
+from traps_pipeline.mechanism.interaction import LaneDesign, lane_metrics
 from traps_pipeline.models.local.adapter import load_local_model
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.two_events import CLIPS, LANES, LaneItem, lane_items
@@ -64,7 +64,7 @@ def evaluate(
         shares = _shares(answers, asked, scenes)
         design = LaneDesign.of([item.item_id for item, _ in asked])
         for layer in range(states.shape[1]):
-            for held_out, figures in figures_of(states[:, layer], design, FOLDS, RESAMPLES, seed).items():
+            for held_out, figures in lane_metrics(states[:, layer], design, FOLDS, RESAMPLES, seed).items():
                 rounded: dict[str, Any] = {key: round(figures[key], 6) for key in FIGURES}
                 rows.append(LaneFigures(seed, name, held_out, layer, **rounded, **shares))
         report(f"{name}: within {max(row.within for row in rows if row.weights == name):.2f} at its best layer")

@@ -219,7 +219,7 @@ def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]
     rows = []
     for group in groups.values():
         values = np.array([row["value"] for row in group], float)
-        if np.isnan(values).any():  # no features of these items allow this figure
+        if np.isnan(values).any():  # no features of these items allow this metric
             continue
         rows.append(group[0] | {"value": values.mean(), "spread": values.std(), "low": None, "high": None})
     return rows

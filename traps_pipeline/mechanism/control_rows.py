@@ -87,7 +87,7 @@ STEERING_PECS = Table(
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeBaselineRow(ExtractionColumns):
-    """A figure of the probing protocol on other features than states."""
+    """A metric of the probing protocol on other features than states."""
 
     features: Annotated[
         str, "question words, first frame, all frames, length, time stamps, output margin or noise as wide as states"

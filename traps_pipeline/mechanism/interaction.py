@@ -2,7 +2,7 @@
 
 Where a clip of two events hides exactly one, neither the clip nor the question tells alone, so that every raw input
 that adds what they tell is at chance by design; the model's output is a rival that may tell. Over all eight items the
-number of boards tells, with random weights too: that figure is the confound and claims nothing.
+number of boards tells, with random weights too: that metric is the confound and claims nothing.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ def interaction_rows(workspace: Workspace, entry: ModelEntry, extraction: Extrac
     output = output_or_note("interaction", entry, states, states, [TWO_EVENTS])
     rivals |= {name: features[TWO_EVENTS] for name, features in ({"length": raw["length"]} | output).items()}
     chosen, joined = _chosen_layer(workspace, states), states.joined
-    by_layer = each_layer(lambda n: figures_of(states.read(TWO_EVENTS, n), design, *resampling), states.n_layers)
-    figures = {(STATES, layer): of_layer for layer, of_layer in enumerate(by_layer)}
-    figures |= {(name, -1): figures_of(features, design, *resampling) for name, features in rivals.items()}
+    by_layer = each_layer(lambda n: lane_metrics(states.read(TWO_EVENTS, n), design, *resampling), states.n_layers)
+    metrics = {(STATES, layer): of_layer for layer, of_layer in enumerate(by_layer)}
+    metrics |= {(name, -1): lane_metrics(features, design, *resampling) for name, features in rivals.items()}
     return [
         InteractionRow(**joined, features=name, layer=layer, chosen=layer in (chosen, -1), held_out=held_out, **row)
-        for (name, layer), by_held_out in figures.items()
+        for (name, layer), by_held_out in metrics.items()
         for held_out, row in by_held_out.items()
     ]
 
@@ -83,7 +83,7 @@ def _chosen_layer(workspace: Workspace, states: StoredStates) -> int | None:
     return chosen_layers(workspace, StoredStates(workspace, probed, states.items), [TWO_EVENTS])[TWO_EVENTS]
 
 
-def figures_of(
+def lane_metrics(
     features: np.ndarray, design: LaneDesign, folds: int, resamples: int, seed: int
 ) -> dict[str, dict[str, Any]]:
     """Return probe metrics of features (n, d), by what is held out of training."""

@@ -58,8 +58,8 @@ def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
 def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
     """Choose the layer of a dataset, a look-alike, or (empty) anything else.
 
-    In a study with fewer than three datasets no pair is left: then the other dataset's own held-out figure counts,
-    which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any figure.
+    In a study with fewer than three datasets no pair is left: then the other dataset's own held-out metric counts,
+    which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any metric.
     """
     target = LOOK_ALIKES.get(target, target)  # read at the layer of the dataset that it resembles
     other_pairs = [pair for pair in curves if target not in pair]

@@ -124,7 +124,7 @@ class ProbeRow(ExtractionColumns):
     ]
     source: Annotated[str, "dataset that the probe or the centroids were fitted on"]
     target: Annotated[str, "dataset that they were applied to"]
-    layer: Annotated[int, "counted as in hidden_states; -1 where there is no figure"]
+    layer: Annotated[int, "counted as in hidden_states; -1 where there is no metric"]
     scope: Annotated[str, "all, or sub_scenario:.. (centroids)"]
     value: Annotated[
         float | None, "AUROC; for shuffled its mean over shuffles; for centroid_* the share assigned to void"
@@ -141,7 +141,7 @@ class ProbeRow(ExtractionColumns):
     own_best: Annotated[bool, "whether this layer has the highest value of its own curve (uses target labels)"]
     all_sample_best: Annotated[bool, "whether this pair's transfer curve is highest at this layer (uses target labels)"]
     chosen: Annotated[bool, "whether the target is read at this layer, chosen on pairs of other datasets alone"]
-    note: Annotated[str | None, "why there is no figure"]
+    note: Annotated[str | None, "why there is no metric"]
 
 
 PROBES = Table(

@@ -162,17 +162,17 @@ def sweep(
 
     def means(number: int) -> list[float]:
         vectors = {name: states.read(name, number) for name in dict.fromkeys(items["dataset"])}
-        figures = []
+        metrics = []
         for column in labels.T:
             swapped = items.assign(side=np.where(column, "void", "control"))
             run = ProbeRun(swapped, lambda name, _: vectors[name], 1, 0, probes, settings.seed, fit=fit)
-            figures.append(np.mean([*(curve[0] for curve in pair_curves(run.comparable_rows(0)).values())]))
-        return figures
+            metrics.append(np.mean([*(curve[0] for curve in pair_curves(run.comparable_rows(0)).values())]))
+        return metrics
 
-    figures = np.array([*each_layer(means, states.n_layers)])
-    low, high = np.quantile(figures[:, 1:], [0.025, 0.975], axis=1)
-    rows = {"layer": range(states.n_layers), "value": figures[:, 0], "null_low": low, "null_high": high}
-    return pd.DataFrame(rows | {"best_null": float(np.quantile(figures[:, 1:].max(axis=0), 0.95))})
+    metrics = np.array([*each_layer(means, states.n_layers)])
+    low, high = np.quantile(metrics[:, 1:], [0.025, 0.975], axis=1)
+    rows = {"layer": range(states.n_layers), "value": metrics[:, 0], "null_low": low, "null_high": high}
+    return pd.DataFrame(rows | {"best_null": float(np.quantile(metrics[:, 1:].max(axis=0), 0.95))})
 
 
 def lens(workspace: Where, model: str, *, prompt: str = "standard") -> pd.DataFrame:

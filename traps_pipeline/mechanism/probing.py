@@ -348,10 +348,10 @@ def _row(
 ) -> Row:
     n_void = int(np.count_nonzero(of.void)) if of else 0
     low, high = interval or (None, None)
-    figures = {"value": value, "low": low, "high": high, "spread": spread}
+    numbers = {"value": value, "low": low, "high": high, "spread": spread}
     return {
         **{"analysis": analysis, "source": path[0], "target": path[1], "layer": layer, "scope": scope},
-        **{name: None if figure is None else float(figure) for name, figure in figures.items()},
+        **{name: None if number is None else float(number) for name, number in numbers.items()},
         **{"n_voids": n_void, "n_controls": len(of.void) - n_void if of else 0, "note": note},
         **{"own_best": False, "all_sample_best": False, "chosen": False},
     }

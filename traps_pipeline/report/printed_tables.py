@@ -1,7 +1,7 @@
 """Show the paper's tables as printed (`assets/published`), without arithmetic.
 
 `tables.csv` gives each table's card, file and columns. A column is `FIELD=HEADING`, or a field of `COLUMNS`; `#` in
-front of the field says that it is a figure, a `%` or `×` behind it is printed after each value, and `|TEXT` in place of
+front of the field says that it is a number, a `%` or `×` behind it is printed after each value, and `|TEXT` in place of
 an empty one. The files `arranged_*.csv` hold tables that the paper prints across (`tools/paper_audit/arranged.py`).
 """
 
@@ -26,7 +26,7 @@ COLUMNS = {
         *(Column("path", "Source → target"), Column("transfer_type", "Transfer type")),
     )
 }
-_DECLARED = re.compile(r"(?P<figure>#?)(?P<field>[\w.-]+)(?P<unit>[%×]?)(?:\|(?P<empty>[^=]+))?(?:=(?P<heading>.+))?")
+_DECLARED = re.compile(r"(?P<number>#?)(?P<field>[\w.-]+)(?P<unit>[%×]?)(?:\|(?P<empty>[^=]+))?(?:=(?P<heading>.+))?")
 # The rows whose model is marked, since they are of another evaluation or read from other evidence.
 _DAGGERS = {"visual_vs_textual": ("epoch", "verification"), "confabulation_taxonomy": ("doubt_read_from", "trace")}
 
@@ -36,7 +36,7 @@ def paper_tables(card: str) -> list[PrintedTable]:
     tables = [_paper_table(place) for place in as_printed("tables").query("card == @card").to_dict("records")]
     rows = as_printed("other").query("card == @card").reset_index(drop=True)
     columns = [Column("model", "Model"), Column("quantity", "Quantity")]
-    columns += figures({"printed": "Value", "line": "Line"})
+    columns += numbers({"printed": "Value", "line": "Line"})
     return [*tables, *([PrintedTable(f"{card}_text", "In the paper’s text", rows, columns)] if len(rows) else [])]
 
 
@@ -58,7 +58,7 @@ def _as_declared(file: str, declared: str) -> tuple[pd.DataFrame, list[Column]]:
         assert found, f"tables.csv: {text!r} declares no column"
         field, unit, empty = found["field"], found["unit"], found["empty"] or ""
         rows[field] = ["∞" if value == "inf" else value + unit if value else empty for value in rows[field]]
-        kind = "range" if found["figure"] else "text"
+        kind = "range" if found["number"] else "text"
         columns.append(Column(field, found["heading"], kind) if found["heading"] else COLUMNS[field])
     return rows, columns
 
@@ -80,7 +80,7 @@ def titled_rows(file: str) -> pd.DataFrame:
     return rows
 
 
-def figures(names: Mapping[str, str]) -> list[Column]:
+def numbers(names: Mapping[str, str]) -> list[Column]:
     """Return table columns of metrics (field: heading), formatted as in the paper."""
     return [Column(field, heading, "range") for field, heading in names.items()]
 

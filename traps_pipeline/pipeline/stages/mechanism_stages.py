@@ -128,8 +128,8 @@ def hidden_states(workspace: Workspace, key: str) -> StageOutput:
 
 def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) -> str:
     def is_wrong(row: ProbeRow) -> bool:
-        figures = (row.value, row.low, row.high)
-        return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in figures)
+        numbers = (row.value, row.low, row.high)
+        return any(f is not None and f == f and not -1e-9 <= f <= 1 + 1e-9 for f in numbers)
 
     n_wrong = sum(is_wrong(row) for row in output.rows(PROBES))
     return f"{count_noun(n_wrong, 'row')} with a share outside 0 to 1" if n_wrong else ""
@@ -147,7 +147,7 @@ def _outside_shares(workspace: Workspace, key: str | None, output: StageOutput) 
     kinds=["parquet", "scikitlearn"],
     takes=RunResources(memory_gb=1.0, each_gb=0.5),
     wants=lambda study, key: Extraction.parse(key).prompt in study.probed_prompts,
-    checks=[Check("shares_are_shares", "Every figure and interval lies in [0, 1].", _outside_shares)],
+    checks=[Check("shares_are_shares", "Every number and interval lies in [0, 1].", _outside_shares)],
 )
 def probes(workspace: Workspace, key: str) -> StageOutput:
     """Return probes by layer: transfer, Cf->Cf, within, label-shuffled, centroids."""

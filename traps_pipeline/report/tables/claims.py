@@ -37,28 +37,28 @@ TEXTUAL = tuple(name for name in DATASETS if is_ill_posed(name))
 
 
 class TwoModels(Exception):
-    """A figure joins the states of one model with the answers of another."""
+    """A metric joins the states of one model with the answers of another."""
 
 
 @dataclass(frozen=True)
 class Claim:
     """A claim about a model's inside.
 
-    figure: what is measured; it holds from `bound` on. of: the figure of a model and subject, None where the study has
-    none, NaN where the subject's states do not vary. fails_in: the controls in which the figure must stay below the
-    bound. instead: by subject, the words that stand in place of a figure that no study has.
+    metric: what is measured; it holds from `bound` on. of: the metric of a model and subject, None where the study has
+    none, NaN where the subject's states do not vary. fails_in: the controls in which the metric must stay below the
+    bound. instead: by subject, the words that stand in place of a metric that no study has.
     """
 
     name: str
     says: str
-    figure: str
+    metric: str
     bound: float
     of: Callable[[Results, str, str], float | None]
     fails_in: Sequence[str]
     instead: Mapping[str, str] = field(default_factory=dict)
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
+# --- metrics ----------------------------------------------------------------------------------------------------------
 
 
 def _mean(values: Any) -> float | None:
@@ -85,13 +85,13 @@ def subject_leads(results: Results, model: str, subject: str, targets: Sequence[
     return [part for _, part in rows.groupby(["target", "subject"], observed=True, sort=False)]
 
 
-def _by_features(figure: Callable[[Results, str, dict[str, float]], float], targets: Sequence[str]) -> Any:
-    """Return the figure of a subject's AUROC by features, mean over targets; of a placebo, the largest."""
+def _by_features(metric: Callable[[Results, str, dict[str, float]], float], targets: Sequence[str]) -> Any:
+    """Return the metric of a subject's AUROC by features, mean over targets; of a placebo, the largest."""
 
     def of(results: Results, model: str, subject: str) -> float | None:
         parts = subject_leads(results, model, subject, targets)
         values = [
-            figure(results, str(part["target"].iloc[0]), dict(zip(part["features"], part["auroc"], strict=True)))
+            metric(results, str(part["target"].iloc[0]), dict(zip(part["features"], part["auroc"], strict=True)))
             for part in parts
         ]
         return max(values, default=None) if subject == PLACEBO else _mean(values)
@@ -165,15 +165,15 @@ def _gate(results: Results, model: str, subject: str) -> float | None:
     return _above_others(pecs, subject)
 
 
-def _above_others(figures: dict[Any, float], subject: str) -> float | None:
-    own = figures.get({MODEL: STATES}.get(subject, subject))
-    others = [figures[name] for name in OTHER_GATES if name in figures]
+def _above_others(metrics: dict[Any, float], subject: str) -> float | None:
+    own = metrics.get({MODEL: STATES}.get(subject, subject))
+    others = [metrics[name] for name in OTHER_GATES if name in metrics]
     return None if own is None or not others else own - max(others)
 
 
-def _of_own(figure: Callable[[Results, str], float | None]) -> Callable[[Results, str, str], float | None]:
-    """Return a figure that only the model itself has: its controls are nulls, and the model without the gap."""
-    return lambda results, model, subject: figure(results, model) if subject == MODEL else None
+def _of_own(metric: Callable[[Results, str], float | None]) -> Callable[[Results, str, str], float | None]:
+    """Return a metric that only the model itself has: its controls are nulls, and the model without the gap."""
+    return lambda results, model, subject: metric(results, model) if subject == MODEL else None
 
 
 def _prompt(column: Callable[[pd.DataFrame], Any], joins: bool = True) -> Callable[[Results, str, str], float | None]:
@@ -230,8 +230,8 @@ def _interaction(results: Results, model: str, subject: str) -> float | None:
     rows = rows.loc[(rows["model"] == model) & (rows["prompt"] == (subject if subject in RANDOM else GUIDED))]
     rows = rows.loc[(rows["held_out"] == "families") & rows["chosen"].eq(True)]
     rows = rows.loc[rows["features"].ne(STATES) if subject == RIVAL else rows["features"].eq(STATES)]
-    figures = rows[["auroc", "within"]].min(axis=1).where(rows["same"].ne(1) | rows["features"].ne(STATES))
-    return None if subject == PLACEBO or rows.empty else float(figures.max())
+    metrics = rows[["auroc", "within"]].min(axis=1).where(rows["same"].ne(1) | rows["features"].ne(STATES))
+    return None if subject == PLACEBO or rows.empty else float(metrics.max())
 
 
 _ALL, _GAP = (*RANDOM, PLACEBO, NO_GAP), (*RANDOM, PLACEBO)
@@ -283,10 +283,10 @@ CLAIMS = (
 
 
 def claim_frame(results: Results) -> pd.DataFrame:
-    """Return a row for each model and claim: its figure `in_` each of SUBJECTS (NaN without one), and a verdict."""
+    """Return a row for each model and claim: its metric `in_` each of SUBJECTS (NaN without one), and a verdict."""
     import pandas as pd
 
-    rows, without_gap = [], no_gap_figures()
+    rows, without_gap = [], no_gap_metrics()
     tables = (results.interaction, results.leads, results.prompted_probes, results.patching)
     for model in dict.fromkeys(str(model) for table in tables for model in table["model"]):
         for claim in CLAIMS:
@@ -296,16 +296,16 @@ def claim_frame(results: Results) -> pd.DataFrame:
                     values[subject] = claim.of(results, model, subject)
                 except TwoModels as joined:
                     values[subject], note = None, f"two models ({joined})"
-            figures = {f"in_{subject}": value for subject, value in values.items()}
+            metrics = {f"in_{subject}": value for subject, value in values.items()}
             words = {f"why_{subject}": _absence(claim, subject, value) for subject, value in values.items()}
-            row = {"model": model, "claim": claim.name, **figures, **words}
+            row = {"model": model, "claim": claim.name, **metrics, **words}
             rows.append(row | {"verdict": note or verdict(claim, values)})
     fields = (f"{kind}_{subject}" for kind in ("in", "why") for subject in SUBJECTS)
     return pd.DataFrame(rows, columns=pd.Index(["model", "claim", *fields, "verdict"]))
 
 
 def _absence(claim: Claim, subject: str, value: float | None) -> str:
-    """Return why a subject has no figure of a claim, in words for a cell; empty if it has one."""
+    """Return why a subject has no metric of a claim, in words for a cell; empty if it has one."""
     if value is None:
         return claim.instead.get(subject, "not run")
     return "" if value == value else "constant"
@@ -324,8 +324,8 @@ def verdict(claim: Claim, values: Mapping[str, float | None]) -> str:
     return "holds" if {*controls} - {RIVAL} or not claim.fails_in else "no control"
 
 
-def no_gap_figures() -> dict[str, float]:
-    """Return the largest figure of each claim in the pocket model without the gap, over its training seeds."""
+def no_gap_metrics() -> dict[str, float]:
+    """Return the largest metric of each claim in the pocket model without the gap, over its training seeds."""
     largest: dict[str, float] = {}
     with NO_GAP_FILE.open(encoding="utf-8", newline="") as stream:
         for row in (row for row in csv.DictReader(stream) if row["subject"] == MODEL):
@@ -346,21 +346,21 @@ def _claims(results: Results) -> PrintedTable:
     by_name = {claim.name: claim for claim in CLAIMS}
     rows = rows.assign(
         says=[by_name[name].says for name in rows["claim"]],
-        figure=[f"{by_name[name].figure} ≥ {by_name[name].bound:g}" for name in rows["claim"]],
+        metric=[f"{by_name[name].metric} ≥ {by_name[name].bound:g}" for name in rows["claim"]],
         **{f"cell_{name}": claim_cells(rows, name) for name in SUBJECTS},
     ).drop(columns=[f"why_{name}" for name in SUBJECTS])
     columns = [
-        MODEL_COLUMN, Column("says", "Claim"), Column("figure", "Holds if"),
+        MODEL_COLUMN, Column("says", "Claim"), Column("metric", "Holds if"),
         *(Column(f"cell_{name}", SUBJECT_NAMES[name], "range") for name in SUBJECTS), Column("verdict", "Verdict"),
     ]  # fmt: skip
     notes = [
-        "a claim holds if its figure reaches the bound in the model and in none of the controls that it must fail in; "
+        "a claim holds if its metric reaches the bound in the model and in none of the controls that it must fail in; "
         "others are shown and do not count",
         "random: the same network with random weights, two seeds, under the same prompt; placebo: answerable items in "
-        "the place of voids, the largest figure; pocket, no gap: a model that says all that it encodes, the largest "
-        "figure of its seeds",
-        "words for figures: same clip, both questions are of one, so that no placebo differs; subtracted, the "
-        "figure is a difference from it; not asked, it gave no answers; constant, its states are one for all items",
+        "the place of voids, the largest metric; pocket, no gap: a model that says all that it encodes, the largest "
+        "metric of its seeds",
+        "words for numbers: same clip, both questions are of one, so that no placebo differs; subtracted, the "
+        "metric is a difference from it; not asked, it gave no answers; constant, its states are one for all items",
         "probes are fitted on other datasets; rivals: words, pixels, length, time stamps, the output margin, and a "
         "probe on the logits of the first token",
     ]
@@ -369,6 +369,6 @@ def _claims(results: Results) -> PrintedTable:
 
 
 def claim_cells(rows: pd.DataFrame, subject: str) -> list[str]:
-    """Return a subject's printed figures, or the words that stand in their place."""
-    figures = zip(rows[f"in_{subject}"], rows[f"why_{subject}"], strict=True)
-    return [why or fraction(value) for value, why in figures]
+    """Return a subject's printed metrics, or the words that stand in their place."""
+    metrics = zip(rows[f"in_{subject}"], rows[f"why_{subject}"], strict=True)
+    return [why or fraction(value) for value, why in metrics]

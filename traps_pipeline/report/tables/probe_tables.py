@@ -63,7 +63,7 @@ class RowRule(NamedTuple):
 
 
 _LAYER_AND_VALUE = ("layer", "value", "low", "high")
-# The figures of a pair of datasets, by the prefix of their columns in `best_layers`.
+# The metrics of a pair of datasets, by the prefix of their columns in `best_layers`.
 PAIR_METRICS = {
     "best": RowRule("transfer", "own_best", (*_LAYER_AND_VALUE, "n_voids", "n_controls")),
     "chosen": RowRule("transfer", "chosen", _LAYER_AND_VALUE),
@@ -72,7 +72,7 @@ PAIR_METRICS = {
     "cf_own": RowRule("confabulated", "own_best", ("layer", "value")),
     "cf_held_out": RowRule("confabulated_held_out", "all_sample_best"),
 }
-# The analyses whose baselines stand beside a pair's figures, by the prefix of their columns.
+# The analyses whose baselines stand beside a pair's metrics, by the prefix of their columns.
 BASELINES = {"": "transfer", "cf_": "confabulated", "held_": "held_out", "cf_held_": "confabulated_held_out"}
 
 
@@ -86,13 +86,13 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
     transfers = by_pair("transfer", rows["model"].notna())
     is_known = rows["value"].notna()
-    figures = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_METRICS.items()}
+    metrics = {name: by_pair(rule.analysis, rows[rule.flag].eq(True) & is_known) for name, rule in PAIR_METRICS.items()}
     notes = [by_pair(name, rows["note"].notna()) for name in ("confabulated", "confabulated_held_out")]
     table = [
         dict(zip(KEYS, key, strict=True))
         | {"path": path_name(*key[1:]), "transfer_type": transfer_type(*key[1:])}
         | {
-            f"{name}_{c}": figures[name].get(key, {}).get(c, np.nan)
+            f"{name}_{c}": metrics[name].get(key, {}).get(c, np.nan)
             for name, rule in PAIR_METRICS.items()
             for c in rule.columns
         }
@@ -105,7 +105,7 @@ def best_layers(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _pairs(results: Results) -> pd.DataFrame:
-    """Return `best_layers` with BASELINES beside its figures, and marks."""
+    """Return `best_layers` with BASELINES beside its metrics, and marks."""
     rows = best_layers(results.probes)
     if not len(rows):
         return rows
@@ -174,10 +174,10 @@ def _confabulated_table(results: Results, pairs: pd.DataFrame) -> PrintedTable:
 def _means(results: Results, rows: pd.DataFrame) -> PrintedTable:
     if len(rows):
         baseline_names = [f"{prefix}{name}" for prefix in ("", "cf_") for name in ("raw_value", "margin", "noise")]
-        figures = [*(f"{name}_value" for name in PAIR_METRICS), *baseline_names, "held_noise", "cf_held_noise"]
+        metrics = [*(f"{name}_value" for name in PAIR_METRICS), *baseline_names, "held_noise", "cf_held_noise"]
         sides = ("best_n_voids", "best_n_controls", "cf_n_voids", "cf_n_controls")
         by = (
-            dict[str, Any].fromkeys(figures, "mean")
+            dict[str, Any].fromkeys(metrics, "mean")
             | {"raw": _names_by_frequency, "cf_raw": _names_by_frequency}
             | dict.fromkeys(sides, "min")
         )
