@@ -10,16 +10,19 @@ import pytest
 
 from tools.pocket.batches import NAMED
 from tools.pocket.data import ShardJob, params_digest, shard_jobs
+from tools.pocket.lane_evaluation import LaneFigures, evaluate
 from tools.pocket.lanes import LaneScene, LaneScenes, draw_shard, released_digests
 from tools.pocket.recipe import LANES as FOLDER
-from tools.pocket.recipe import Recipe, load_recipe
+from tools.pocket.recipe import NO_GAP, Recipe, load_recipe
+from tools.pocket.seeds import read_seeds
 from tools.pocket.words import ABSTENTION, ANSWER, COLUMNS, ROWS
 from traps_pipeline.benchmark.records import two_events_lines
+from traps_pipeline.models.registry.entries import get_model
 from traps_pipeline.protocol.two_events import CLIPS, LANES
 from traps_pipeline.scenes.physics.kit import params_to_dict
 
 pytestmark = pytest.mark.slow
-FEW = 2  # scenes
+FEW, UNSEEN = 2, 8  # scenes
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +90,20 @@ def test_the_asked_lane_alone_decides_what_is_said(recipe: Recipe, data: Path) -
             assert label == (None if hidden[lane] else record.answers[lane])
             seen.add((name, hidden[lane]))
     assert len(seen) == 4
+
+
+@pytest.mark.parametrize(("name", "holds"), [("pocket-lanes", True), (NO_GAP, False)])
+def test_one_shipped_model_holds_which_event_is_asked_and_hidden_and_another_does_not(
+    name: str, holds: bool, recipe: Recipe, tmp_path: Path
+) -> None:
+    """Scenes of no seed that it was trained on; at the last layer, a probe fitted on other scenes."""
+    entry = get_model(name)
+    unseen = recipe.model_copy(update={"held_out": UNSEEN, "data_seed": 9, "media": entry.media})
+    (job,) = shard_jobs(unseen, "held-out", tmp_path)
+    draw_shard(job)
+    *_, last = evaluate(entry, LaneScenes(unseen, tmp_path, "held-out"), 1, weights=(None,))
+    assert last.n_clips == 2 * UNSEEN and (last.within > 0.8) == holds
+    assert (last.abstained > 0.8) == holds
+    measured = [row for row in read_seeds(FOLDER / "interaction.csv", LaneFigures) if row.held_out == "families"]
+    within = {(row.weights, row.layer): row.within for row in measured}
+    assert within["model", last.layer] > 0.8 > max(within[weights, last.layer] for weights in ("random_0", "random_1"))

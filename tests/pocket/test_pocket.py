@@ -16,7 +16,7 @@ from tools.pocket.__main__ import build_parser
 from tools.pocket.commands import CARD, FACTS, MECHANISM, WEIGHTS
 from tools.pocket.data import STREAM, SceneRecord, ShardJob, draw_shard, released_digests, shard_jobs
 from tools.pocket.evaluate import AnswerCounts, markdown
-from tools.pocket.recipe import GAP, SHIPPED, Recipe, load_recipe
+from tools.pocket.recipe import GAP, LANES, POCKET, SHIPPED, Recipe, load_recipe
 from tools.pocket.seeds import read_seeds
 from tools.pocket.words import PROMPTS, say
 from traps_pipeline.base.digests import digest, file_digest
@@ -184,7 +184,11 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(recipe: Recipe, data: Pat
 # --- what ships -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("folder", SHIPPED.values(), ids=[*SHIPPED])
+def test_all_that_ships_is_less_than_ten_megabytes() -> None:
+    assert sum(file.stat().st_size for file in POCKET.rglob("*") if file.is_file()) < 10e6
+
+
+@pytest.mark.parametrize("folder", [*SHIPPED.values(), LANES], ids=[*SHIPPED, "pocket-lanes"])
 def test_shipped_weights_are_small_and_are_those_of_the_facts(folder: Path) -> None:
     from safetensors import safe_open
 

@@ -22,12 +22,14 @@ Split = Literal["train", "held-out"]
 
 
 class Training(BaseModel):
-    """How the weights are fitted. void_share: share of void clips in a batch; brightness: augmentation; naming: weight
-    of the naming loss; naming_steps: number of first steps with the naming loss alone; pairs: from a step on, how many
-    pairs of frames of each clip are shown (`batches.Scenes.pairs`); all before the first."""
+    """How the weights are fitted. stop: the step with which training ends early, while its rate is not yet 0;
+    void_share: share of void clips in a batch; brightness: augmentation; naming: weight of the naming loss;
+    naming_steps: number of first steps with the naming loss alone; pairs: from a step on, how many pairs of frames of
+    each clip are shown (`batches.Scenes.pairs`); all before the first."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     steps: int = Field(ge=1)
+    stop: int | None = None
     batch: int = Field(ge=1)
     learning_rate: float = Field(gt=0)
     warmup_steps: int = Field(ge=0)
@@ -37,6 +39,11 @@ class Training(BaseModel):
     naming: float = Field(ge=0)
     naming_steps: int = Field(ge=0)
     pairs: dict[int, int]
+
+    @property
+    def last(self) -> int:
+        """The step with which training ends."""
+        return self.stop or self.steps
 
     def pairs_at(self, step: int) -> int | None:
         """Return how many pairs of frames are shown at a step; None for all."""

@@ -182,7 +182,7 @@ def train(
     words = name_tokens(processor.tokenizer, scenes.words).to(device)
     state = _State(folder / "state.pt", model, optimizer, identity)
     step = state.load()
-    last = training.steps if stop_after is None else min(stop_after, training.steps)
+    last = training.last if stop_after is None else min(stop_after, training.last)
     made = DataLoader(
         cast(Any, batches), None, sampler=range(step, last), num_workers=0 if device == "cpu" else LOADERS
     )
@@ -204,8 +204,8 @@ def train(
             lately.append(loss.detach())
             now = time.monotonic()
             if now - reported > PROGRESS_S or step == last:
-                loss, left = torch.stack(lately).mean(), (now - began) / (step - first) * (training.steps - step) / 60
-                report(f"step {step} of {training.steps}, loss {loss:.3f}, {left:.0f} min left")
+                loss, left = torch.stack(lately).mean(), (now - began) / (step - first) * (training.last - step) / 60
+                report(f"step {step} of {training.last}, loss {loss:.3f}, {left:.0f} min left")
                 reported, lately = now, []
             if now - kept > CHECKPOINT_S:
                 state.save(step)
@@ -213,6 +213,6 @@ def train(
     finally:
         if whole:
             state.save(step)
-    if step == training.steps:
+    if step == training.last:
         save(model.eval(), processor, weights)
     return weights
