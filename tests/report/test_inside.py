@@ -20,7 +20,7 @@ from traps_pipeline.report.figures.looks import arrow
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.study_results import StudyResults
 from traps_pipeline.report.tables import control_reports
-from traps_pipeline.report.tables.claims import Claim, claim_frame, verdict
+from traps_pipeline.report.tables.claims import CLAIMS, SUBJECT_NAMES, Claim, claim_frame, verdict
 from traps_pipeline.report.tables.claims import claims as claim_tables
 from traps_pipeline.report.tables.inside_columns import why_not
 from traps_pipeline.report.tables.patching_tables import patching as patching_table
@@ -234,3 +234,9 @@ def test_only_a_study_without_a_mechanism_section_is_told_so() -> None:
     assert "`mechanism`" in why_not(made)
     made.mechanism = MechanismSettings(models={"tiny": Layers(steering=1, centroid=1)})
     assert why_not(made) and "`mechanism`" not in why_not(made)
+
+
+def test_a_claim_whose_metric_is_undefined_is_not_measured_and_never_held():
+    for claim in CLAIMS:  # as of a network of random weights, no answer of which is decided
+        assert verdict(claim, dict.fromkeys(SUBJECT_NAMES, float("nan"))) == "not measured"
+        assert verdict(claim, dict.fromkeys(SUBJECT_NAMES)) == "not measured"
