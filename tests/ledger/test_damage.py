@@ -249,6 +249,17 @@ def test_money_of_rows_that_vanished_counts_until_it_is_released(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    "note",
+    ["", "{}", "[" * 100_000, "[1e999, {}]", '[1, {"m": 1e999}]', f'[1, {{"m": {10**400}}}]', '[1, {"\\ud800": 1}]'],
+)
+def test_a_damaged_note_of_money_is_not_believed(tmp_path: Path, note: str) -> None:
+    write(local(tmp_path), paid("a", 0.5))
+    (tmp_path / "ledger.booked.json").write_text(note)
+    with (ledger := local(tmp_path)).database.writing():
+        assert Money(ledger.database).spent() == {"m": 0.5}
+
+
 @pytest.mark.slow
 def test_money_of_a_killed_run_counts_where_its_log_is_lost(tmp_path: Path) -> None:
     place = Place(("sqlite", str(tmp_path)))
