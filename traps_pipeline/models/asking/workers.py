@@ -65,10 +65,15 @@ class Asking:
         if attempt_result is None:
             return False
         outcome = attempt_result[0] if self.again is None else self.again(attempt_result[0])
-        row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
-        progress.current().called(name, not is_settled(row), row["latency_s"], row["cost_usd"] or 0.0)
-        if self.again is None:
-            participant.breaker.watch(outcome)
+        try:
+            if self.again is None:
+                participant.breaker.watch(outcome)
+        except TrapsError:  # the participant is stopped
+            self.its.is_over = True  # at once: no further call is sent while the row is written
+            raise
+        finally:
+            row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
+            progress.current().called(name, not is_settled(row), row["latency_s"], row["cost_usd"] or 0.0)
         return True
 
     async def write(self, request: Request, outcome: Outcome, attempts: int, seconds: float, paid_by: list[str]) -> Row:
