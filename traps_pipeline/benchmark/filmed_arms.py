@@ -26,7 +26,7 @@ from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
-from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import Clip, clip_note_path, read_clip, save_clip
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
@@ -150,7 +150,7 @@ def _is_missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> boo
     spec = spec_of(row)
     for arm, clip in clips.items():
         result = ArmResult.read(_finding_of(clip), _record_digest(spec, arm)) if _finding_of(clip) in existing else None
-        if result is None or (result.frames and not {clip, note_of(clip)} <= existing):
+        if result is None or (result.frames and not {clip, clip_note_path(clip)} <= existing):
             return True
     return False
 
@@ -161,7 +161,7 @@ def _finding_of(clip: Path) -> Path:
 
 def _files(clip: Path) -> tuple[Path, ...]:
     """Return an arm's files: its clip with the note (none if refused), and the result."""
-    return clip, note_of(clip), _finding_of(clip)
+    return clip, clip_note_path(clip), _finding_of(clip)
 
 
 @cache

@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.protocol.two_events import CLIPS, LANES
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import clip_note_path, read_clip, save_clip
 from traps_pipeline.scenes.worlds.lane_records import RecordedEvents, TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.benchmark_tables import ArmRow
@@ -71,7 +71,9 @@ def film_lanes(
     rows: list[Row] = [{"scenario_id": id_} for id_ in specs]
 
     def files(row: Row) -> list[Path]:
-        return [file for clip in lane_paths(workspace, specs[row["scenario_id"]]) for file in (clip, note_of(clip))]
+        return [
+            file for clip in lane_paths(workspace, specs[row["scenario_id"]]) for file in (clip, clip_note_path(clip))
+        ]
 
     def missing(rows: Sequence[Row]) -> list[Row]:
         existing = workspace.store.there(file for row in rows for file in files(row))

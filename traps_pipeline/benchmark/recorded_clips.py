@@ -14,8 +14,8 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.footage import FPS, Footage, UnusableFootage, read_footage
 from traps_pipeline.benchmark.recorded_pairs import Board, RecordedPair
 from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
-from traps_pipeline.scenes.parts.look import LINE_SHARE, OCCLUDERS, occluder_tones
-from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip
+from traps_pipeline.scenes.parts.look import LINE_SHARE, OCCLUDERS, occluder_texture
+from traps_pipeline.scenes.worlds.clip_notes import clip_note_path, read_clip
 from traps_pipeline.video.encode import DamagedClip
 
 FALL_S = 0.5  # in which a board comes, gaining speed evenly; the released boards fall for 0.39 to 0.61 s
@@ -151,7 +151,7 @@ def _panel(width: int, height: int, name: str) -> np.ndarray:
     colours = [*OCCLUDERS.values()]
     colour = BOARD_TONE * np.array(colours[int(digest(name)[:8], 16) % len(colours)])
     down = np.arange(height) - height // 2
-    panel = occluder_tones(colour, (down >= 0) & (down < max(1, round(LINE_SHARE * height / 2))))
+    panel = occluder_texture(colour, (down >= 0) & (down < max(1, round(LINE_SHARE * height / 2))))
     panel[: max(2, round(EDGE_SHARE * height))] = np.rint(255 * EDGE_TONE * colour)
     return np.repeat(panel[:, None], width, axis=1)
 
@@ -191,4 +191,4 @@ def copy_clips(released: Path, scenario_id: str, clips: Mapping[str, str], targe
         if not is_whole(clip, clips[side]):
             raise TrapsError(f"{clip}: is missing or not the clip that was imported; import the folder again")
         write_bytes(target, clip.read_bytes())
-        write_bytes(note_of(target), note_of(clip).read_bytes())
+        write_bytes(clip_note_path(target), clip_note_path(clip).read_bytes())

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.workers import run_in_order
-from traps_pipeline.scenes.worlds.clip_notes import Clip, check_clip, note_of, read_note
+from traps_pipeline.scenes.worlds.clip_notes import Clip, check_clip, clip_note_path, read_note
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 from traps_pipeline.video.encode import DamagedClip
@@ -111,7 +111,7 @@ class _Sharing(Generic[Job]):
 def existing_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
     """Return existing clips' notes, unfetched. Raises TrapsError if one differs."""
     paths = [*clips]
-    store.bring(map(note_of, paths))
+    store.bring(map(clip_note_path, paths))
     digests = store.digests(paths)
     try:
         notes = {path: note for path in digests if (note := read_note(path)) is not None}

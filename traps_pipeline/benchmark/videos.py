@@ -14,7 +14,7 @@ from traps_pipeline.benchmark.specs import clips_version, released_in_study, spe
 from traps_pipeline.protocol.datasets import RECORDED
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
-from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip
+from traps_pipeline.scenes.worlds.clip_notes import Clip, clip_note_path, read_clip
 from traps_pipeline.scenes.worlds.clips import Job, render_pair
 from traps_pipeline.storage.benchmark_tables import VideoRow
 from traps_pipeline.storage.workspace import Workspace
@@ -90,7 +90,7 @@ def _clips(workspace: Workspace, row: Row) -> dict[str, Path]:
 
 
 def _files(workspace: Workspace, row: Row) -> list[Path]:
-    return [file for clip in _clips(workspace, row).values() for file in (clip, note_of(clip))]
+    return [file for clip in _clips(workspace, row).values() for file in (clip, clip_note_path(clip))]
 
 
 def _job(workspace: Workspace, row: Row) -> Job:

@@ -150,7 +150,7 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
                 rows.append(
                     row_keys
                     | {"judge": judge, "expected": expected, "clean": plain_vote, "vote": vote}
-                    | {"result": result(expected, plain_vote, vote)}
+                    | {"result": attack_effect(expected, plain_vote, vote)}
                     | {"invalid_reason": cast and cast.invalid_reason, "rationale": cast and cast.rationale}
                 )
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_ROBUSTNESS.names))
@@ -162,7 +162,7 @@ def _majority_decision(votes: Sequence[Vote]) -> bool | None:
     return {YES: True, NO: False, INVALID: None}[int(majority(np.array([values], np.int8))[0])]
 
 
-def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
+def attack_effect(expected: bool, clean: bool | None, vote: bool | None) -> str:
     """Return an attack's effect on a vote: one of RESULTS."""
     if vote is expected:
         return "held"

@@ -28,7 +28,7 @@ from traps_pipeline.mechanism.gate import (
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.mechanism.nulls import nan_to_null
-from traps_pipeline.mechanism.probes import swapped_labels
+from traps_pipeline.mechanism.probes import side_swapped_labels
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry.entries import ModelEntry
@@ -151,7 +151,7 @@ def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled
     for name, rows in features.items():
         values[(table["dataset"] == name).to_numpy()] = rows
     if shuffled:
-        void = swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
+        void = side_swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
         table = table.assign(void=void)
     return GateItems(table, values)
 

@@ -18,7 +18,7 @@ from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_tabl
 from traps_pipeline.mechanism.layer_choice import pair_curves
 from traps_pipeline.mechanism.lens import lens_rows
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, PROBES
-from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe, swapped_labels
+from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe, side_swapped_labels
 from traps_pipeline.mechanism.probing import ProbeRun, each_layer
 from traps_pipeline.mechanism.stages import examined_model
 from traps_pipeline.mechanism.stored_states import StoredStates
@@ -157,7 +157,7 @@ def sweep(
     states = study_states(workspace, model, prompt)
     settings, items = states.workspace.mechanism, states.items.loc[states.items["dataset"].isin(DATASETS)]
     void, scenario = (items["side"] == "void").to_numpy(), pd.factorize(items["scenario_id"])[0]
-    labels = np.column_stack([void, swapped_labels(void, scenario, draws, settings.seed)])
+    labels = np.column_stack([void, side_swapped_labels(void, scenario, draws, settings.seed)])
     probes = settings.probes.model_copy(update={"resamples": 1})  # no interval is read
 
     def means(number: int) -> list[float]:

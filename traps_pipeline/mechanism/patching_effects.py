@@ -123,7 +123,7 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
             yield site, layer, part
 
 
-def run_pass(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
+def trace_pass(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
     """Run one pass; keep states of `sites` and of the residual stream for patches.
 
     tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.

@@ -33,7 +33,7 @@ from traps_pipeline.mechanism.patching_effects import (
     attributed_changes,
     patched_changes,
     require_patchable,
-    run_pass,
+    trace_pass,
 )
 from traps_pipeline.mechanism.probing_versions import extraction_version
 from traps_pipeline.models.local.spans import changed_tokens, token_spans
@@ -157,7 +157,7 @@ class Pairs:
                 if side == patched_side and groups[group].any()
             ]
             patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
-            target_pass, source_margin = run_pass(self._model, target.prompt, self._tokens, ()), 0.0
+            target_pass, source_margin = trace_pass(self._model, target.prompt, self._tokens, ()), 0.0
             for kind in SOURCES:
                 side = self._source(name, patched_side, kind)
                 if side is None:
@@ -172,15 +172,15 @@ class Pairs:
 
     def _attribute(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
         """Return both sides' margins and each token's estimate; free the states."""
-        target_pass = run_pass(self._model, target.prompt, self._tokens, ())
-        source_pass = run_pass(self._model, source.prompt, self._tokens, self._settings.sites)
+        target_pass = trace_pass(self._model, target.prompt, self._tokens, ())
+        source_pass = trace_pass(self._model, source.prompt, self._tokens, self._settings.sites)
         return (target_pass.margin, source_pass.margin), attributed_changes(
             self._model, target_pass, source_pass, self._tokens
         )
 
     def _patch(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return a source's margin, and the changes by its patches; free its states."""
-        source = run_pass(self._model, side.prompt, self._tokens, self._settings.sites)
+        source = trace_pass(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:

@@ -250,7 +250,7 @@ def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
     return place[np.searchsorted(names, scenario)]
 
 
-def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
+def side_swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
     """Return labels (n, shuffles), with sides swapped at random within scenarios.
 
     Each scenario is swapped with probability 0.5. A swap keeps every fold balanced, and any labels of a held-out fold

@@ -23,7 +23,7 @@ from traps_pipeline.mechanism.probes import (
     fit_probe,
     nearest_centroid,
     scenario_folds,
-    swapped_labels,
+    side_swapped_labels,
     transfer_scores,
     within_split,
 )
@@ -218,7 +218,7 @@ class ProbeRun:
         for name in self._own:
             split = splits[name]
             folds = scenario_folds(split.scenario, self.settings.folds, self.seed)
-            shuffled_labels = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
+            shuffled_labels = side_swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
             areas = within_split(split, np.column_stack([split.void, shuffled_labels]), folds)
             shuffled_areas = areas[1:]
             rows.append(_row("within", (name, name), layer, areas[0], split))

@@ -143,7 +143,7 @@ class LocalRuns(Runs):
         failures = [event for event in result.all_events if event.is_step_failure]
         if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
             raise KeyboardInterrupt
-        outcome = problems_of(failures)
+        outcome = failed_outcome(failures)
         if not result.success and not outcome.problems:
             names = ", ".join(stage.name for stage in stages)
             outcome.problems.append(f"{names} {key or ''}: the run failed; see its log in Dagster")
@@ -178,7 +178,7 @@ def this_host() -> str:
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
 
 
-def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
+def failed_outcome(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
     """Return the messages of failed steps."""
     problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
     over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))

@@ -212,7 +212,7 @@ def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
     return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
 
 
-def arithmetic_differences(commitment: Commitment) -> str:
+def environment_differences(commitment: Commitment) -> str:
     """Return how machine and libraries differ from the commitment's, if they do."""
     own_machine = _arithmetic()
     names = [name for name in own_machine if commitment.made_with.get(name) != own_machine[name]]

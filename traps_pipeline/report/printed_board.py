@@ -18,7 +18,7 @@ def board_bytes(tables: Sequence[TextTable]) -> bytes:
     return json.dumps([asdict(table) for table in tables], ensure_ascii=False).encode()
 
 
-def printed_board(workspace: Workspace) -> str:
+def stored_leaderboard_text(workspace: Workspace) -> str:
     """Return a study's leaderboard for standard output, from a report that is fresh."""
     path = workspace.reports / BOARD_FILE
     if workspace.store.has(path):

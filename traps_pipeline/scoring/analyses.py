@@ -112,7 +112,7 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
     rows = overall(cells) if means is None else means
     guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in (GUIDED, STANDARD))
     models = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
-    return pd.DataFrame({"model": models, "ratio": ratio(guided.loc[models], standard.loc[models])})
+    return pd.DataFrame({"model": models, "ratio": divide_elementwise(guided.loc[models], standard.loc[models])})
 
 
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
@@ -218,7 +218,7 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
     means = pd.DataFrame(pooled.groupby(level=["model", "regime"]).mean())
     pooled = means.assign(taxonomy="pooled").reset_index()
     table = pd.concat([rates.reset_index(), pooled], ignore_index=True)
-    table["gap"] = ratio(table["textual"], table["visual"])
+    table["gap"] = divide_elementwise(table["textual"], table["visual"])
     models, places = list(cells["model"].unique()), (*TAXONOMIES, "pooled")
     keys = zip(table["regime"], table["model"], table["taxonomy"], strict=True)
     order = [(regime, models.index(model), places.index(taxonomy)) for regime, model, taxonomy in keys]
@@ -288,7 +288,7 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
         row |= guided[SHARES].mean().add_prefix("guided_").to_dict()
         row |= {f"{share}_uplift": change[share] for share in ("abs_rec", "false_abs")}
         means = [pd.Series([side.loc[common, "abs_rec"].mean()]) for side in (textual_voids, standard)]
-        row |= {"abs_rec_ill_posed": means[0][0], "textual_over_visual": float(ratio(*means)[0])}
+        row |= {"abs_rec_ill_posed": means[0][0], "textual_over_visual": float(divide_elementwise(*means)[0])}
         row["n_missing"] = sum(int(side["n_missing"].sum()) for side in (standard, guided, textual_voids.loc[common]))
         rows.append(row)
     return pd.DataFrame(rows)
@@ -326,7 +326,7 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
+def divide_elementwise(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
     """Divide elementwise: infinite where the denominator is 0, NaN where both are."""
     top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
     with np.errstate(divide="ignore", invalid="ignore"):

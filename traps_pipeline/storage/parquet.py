@@ -288,7 +288,7 @@ def read_sealed(path: Path) -> pa.Table:
     return pq.ParquetFile(_sound_bytes(path)).read()
 
 
-def note_of(path: Path) -> str:
+def partition_note(path: Path) -> str:
     """Return a store's note about a partition (footer, columns), or raise TrapsError."""
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -7,7 +7,7 @@ import datetime
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.base.keys import Address, Variable, read_key
-from traps_pipeline.base.redaction import hide
+from traps_pipeline.base.redaction import redact_environment_variable
 
 
 class Limits(BaseModel):
@@ -35,7 +35,7 @@ class Account(BaseModel):
     @model_validator(mode="after")
     def _is_redacted(self) -> Account:
         if self.key is not None:
-            hide(self.key)
+            redact_environment_variable(self.key)
         return self
 
     def secret(self) -> str | None:

@@ -227,7 +227,7 @@ class ModelEntry(Entry):
 _Entry = TypeVar("_Entry", bound=Entry)
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def _parse(path: Path) -> Any:
     """Return a registry's YAML, from which models and accounts are read in turn."""
@@ -272,7 +272,7 @@ def with_user_entries(entries: dict[str, _Entry], key: user_registry.Kind, kind:
     return entries
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     """Return models by id, in file order. Raises TrapsError naming entry and field."""
@@ -280,7 +280,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     return with_user_entries(models, "models", ModelEntry) if path == MODELS_FILE else models
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Return accounts by name. Raises TrapsError naming account and field."""
@@ -357,7 +357,7 @@ def reference_rows() -> list[str]:
     return [*filter(is_reference, load_models())]
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def local_models() -> tuple[str, ...]:
     """Return models whose hidden states can be read, in file order."""

@@ -127,7 +127,7 @@ class JudgeEntry(Entry):
         return JUDGE_PROTOCOL
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
     """Return judges by id. Raises TrapsError naming judge and field."""
@@ -141,7 +141,7 @@ def thinking_of(judge: str) -> Marks | None:
     return entry.thinking if entry else None
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """Return a panel's judges (three, or one). Raises TrapsError naming the file."""

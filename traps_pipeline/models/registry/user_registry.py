@@ -84,7 +84,7 @@ _overlay: list[tuple[Path, UserRegistry]] = []  # additions of the command's exp
 _clearers: list[Callable[[], None]] = []  # clear the caches of the registries
 
 
-def cached_registry(cached: Cached) -> Cached:
+def clear_on_new_entries(cached: Cached) -> Cached:
     """Decorate a cached registry reader; adding entries clears its cache."""
     _clearers.append(cached.cache_clear)  # pyright: ignore[reportAttributeAccessIssue] - of functools.cache
     return cached

@@ -46,7 +46,7 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {m: (colours[m], MARKERS[models_by_colour[colours[m]].index(m) % len(MARKERS)]) for m in models}
 
 
-def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
+def set_j_accuracy_axes(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
     """Set axes of J and accuracy that hold all points, and draw contours of PECS.
 
     At least half of each axis is shown. intervals: whether the limits include the points' 95 % intervals.

@@ -30,7 +30,7 @@ from traps_pipeline.scenes.certification.evidence import (
 from traps_pipeline.scenes.parts.difficulty import DISTRACTOR
 from traps_pipeline.scenes.parts.look import fineness
 from traps_pipeline.scenes.parts.wording import FAR_COLOUR, false_premises, none_as_answer, refutation
-from traps_pipeline.scenes.physics.flexes import flexes, is_carrier
+from traps_pipeline.scenes.physics.flexes import flexes, soft_body_mask
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture import checks
@@ -512,7 +512,7 @@ def _referents(pair: Pair) -> Evidence:
     control = pair.control
     assert control.occluder is not None, "a pair with an occluder has an occluder"
     scene, model, fps = control.scene, control.model, control.physics.fps / control.frame_step
-    rigid = np.flatnonzero((model.body_weldid > 0) & ~is_carrier(model))
+    rigid = np.flatnonzero((model.body_weldid > 0) & ~soft_body_mask(model))
     bodies = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
     # Distractors are neither named nor the cause.
     moving_bodies = {body for body in bodies if not body.startswith(DISTRACTOR)}

@@ -72,7 +72,7 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder
     return float((motion_mask & board).sum() / max(1, motion_mask.sum()))
 
 
-def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
+def occluded_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
     """Yield the void of a trajectory, without some geoms."""
     yield from renderer.frames(qpos, occluder=True, without=without)
 
@@ -96,8 +96,8 @@ def ablation_pixels(
 
     void: the frames with them, if they are drawn already.
     """
-    complete_frames = void_frames(renderer, qpos) if void is None else void
-    return differing_pixels(complete_frames, void_frames(renderer, qpos, without=geoms))[0]
+    complete_frames = occluded_frames(renderer, qpos) if void is None else void
+    return differing_pixels(complete_frames, occluded_frames(renderer, qpos, without=geoms))[0]
 
 
 def differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> tuple[int, int]:

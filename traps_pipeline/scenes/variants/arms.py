@@ -115,7 +115,7 @@ class Arm:
     film: Callable[[Scenario], Take]
 
 
-def must_answer(spec: SceneSpec) -> list[Question]:
+def questions_to_answer(spec: SceneSpec) -> list[Question]:
     """Return the record's question for the arm's clip, to be answered."""
     return [Question("control", spec.question, spec.ground_truth)]
 
@@ -226,7 +226,7 @@ ARMS: Mapping[str, Arm] = {
             "an occluder at the end means: abstain",
             "up to the last frame before the outcome is settled the control is seen, and some sampled frame of it "
             f"differs from the other world's in at least {SEEN_PX:.0f} pixels, so that what follows can be inferred",
-            must_answer,
+            questions_to_answer,
             _late_occluder,
         ),
         Arm(
@@ -234,7 +234,7 @@ ARMS: Mapping[str, Arm] = {
             "a short clip means: abstain",
             "the control's last frames before it closes, as many as the void has, from which the observer answers "
             "rightly",
-            must_answer,
+            questions_to_answer,
             _length_matched,
         ),
         Arm(
@@ -242,7 +242,7 @@ ARMS: Mapping[str, Arm] = {
             "a cut means: abstain",
             f"the control is cut up to {LEAD_FRAMES[0]} frames before its outcome is settled, where at least "
             f"{AGREE_SHARE:.0%} of {FUTURES} futures of the last frame, perturbed as for `open`, end in the answer",
-            must_answer,
+            questions_to_answer,
             _predictable_cut,
         ),
         Arm(

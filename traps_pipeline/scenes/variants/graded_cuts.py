@@ -12,7 +12,7 @@ from traps_pipeline.protocol.datasets import GRADED
 from traps_pipeline.scenes.certification.certificates import earliest_cut, futures_of
 from traps_pipeline.scenes.certification.ensemble import READ_OVER_S, UNSEEN_PX
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.variants.arms import Arm, Scenario, Take, must_answer
+from traps_pipeline.scenes.variants.arms import Arm, Scenario, Take, questions_to_answer
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
@@ -81,6 +81,6 @@ GRADED_CUT = Arm(
     f"of {FUTURES} states at the cut that no viewer tells apart (places differ by {UNSEEN_PX} px, speeds by what that "
     f"is over {READ_OVER_S} s, one standard deviation) at least {MIN_DECIDED:.0%} end in an answer within {BEYOND_S:g} "
     "s after the clip; their shares are the answers' probabilities",
-    must_answer,
+    questions_to_answer,
     _film,
 )

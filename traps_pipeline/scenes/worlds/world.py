@@ -14,7 +14,7 @@ from traps_pipeline.scenes.physics.flexes import flexes
 from traps_pipeline.scenes.physics.kit import Family, Inventory, Motion, Physics, Scene
 from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture.camera import Camera, Closing, Occluder
-from traps_pipeline.scenes.picture.checks import PastOccluder, differing_pixels, void_frames
+from traps_pipeline.scenes.picture.checks import PastOccluder, differing_pixels, occluded_frames
 from traps_pipeline.scenes.picture.coming_board import Coming, coming_board
 from traps_pipeline.scenes.picture.render import SUPERSAMPLE, Renderer
 from traps_pipeline.scenes.worlds.outcome import (
@@ -172,7 +172,7 @@ class World:
         missing = [frame for frame in frames if frame not in self._behind]
         if missing:
             with self.closed_renderer() as renderer:
-                self._behind.update(zip(missing, void_frames(renderer, self.qpos[missing]), strict=True))
+                self._behind.update(zip(missing, occluded_frames(renderer, self.qpos[missing]), strict=True))
         return [self._behind[frame] for frame in frames]
 
     @cached_property
@@ -200,7 +200,7 @@ class World:
         if missing:
             complete_frames = self.behind_occluder(missing)
             with self.closed_renderer() as renderer:
-                ablated_frames = void_frames(renderer, self.qpos[missing], without=geoms)
+                ablated_frames = occluded_frames(renderer, self.qpos[missing], without=geoms)
                 for frame, ablated, unablated in zip(missing, complete_frames, ablated_frames, strict=True):
                     self._ablated[frame, geoms] = differing_pixels([ablated], [unablated])[0]
         return sum(self._ablated[frame, geoms] for frame in frames)
