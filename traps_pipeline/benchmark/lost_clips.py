@@ -8,7 +8,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 def missing_clips(workspace: Workspace, category: str) -> Sequence[str]:
-    """Return a category's clips that are missing or of a wrong size."""
+    """Return the paths of a category's clips that are missing or of a wrong size."""
     table = workspace.tables.read_arrow(VIDEOS, ["path", "size_bytes"], category=category)
     expected = dict(zip(table["path"].to_pylist(), table["size_bytes"].to_pylist(), strict=True))
     notes = {path: workspace.relative(clip_note_path(workspace.root / path)) for path in expected}

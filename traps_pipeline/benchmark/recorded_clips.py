@@ -25,7 +25,7 @@ BOARD_TONE = 0.86  # of its colour under the simulator's light
 
 @dataclass(frozen=True)
 class RecordedClips:
-    """A scenario's clips by side, each frames (H, W, 3); how the void hides; evidence and remarks on them."""
+    """The frames (H, W, 3) of a recorded scenario's clips by side, how the void hides, evidence and remarks."""
 
     clips: dict[str, list[np.ndarray]]
     void: dict[str, Any]
@@ -34,7 +34,7 @@ class RecordedClips:
 
 
 def make_clips(pair: RecordedPair, folder: Path) -> RecordedClips:
-    """Cut a recorded pair's two clips from its videos. Raises UnusableFootage naming the clip that cannot be made."""
+    """Return a recorded pair's clips, cut from its videos. Raises UnusableFootage naming a clip that cannot be made."""
     files = {side: name for side in ("control", "void", "twin") if (name := getattr(pair, side)) is not None}
     footage, originals, notes = dict[str, Footage](), dict[str, str](), list[str]()
     for side, name in files.items():
@@ -170,12 +170,12 @@ def _twin_proof(pair: RecordedPair, twin: Footage, hiding: dict[str, Any], void:
 
 
 def clip_path(folder: Path, scenario_id: str, side: str) -> Path:
-    """Return the place of a recorded clip below a folder of released records."""
+    """Return the path of a recorded clip below a folder of released records."""
     return folder / "clips" / scenario_id / f"{side}.mp4"
 
 
 def is_whole(path: Path, sha256: str) -> bool:
-    """Return whether a clip with its note is there, and is the one that was imported."""
+    """Return whether a clip and its note exist, and it is the one that was imported."""
     with suppress(DamagedClip):
         return (clip := read_clip(path)) is not None and clip.file_sha256 == sha256
     return False

@@ -70,7 +70,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
-    """Return clips, and occluded voids' leaked pixels. Raises TrapsError if missing."""
+    """Return a category's VIDEOS rows, and leaked pixels by void with an occluder. Raises TrapsError without a clip."""
     specs = spec_rows(workspace, category)
     clips = existing_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row).values()))
     version = clips_version(workspace, category, specs)

@@ -70,7 +70,7 @@ class Judge(typing.Protocol):
 
     @property
     def backend(self) -> str:
-        """Where the judge answers: over the network, by rules, or in a package's way."""
+        """The kind of backend that answers: over the network, by rules, or of an installed package."""
         ...
 
     @property
@@ -85,12 +85,12 @@ class Judge(typing.Protocol):
 
     @property
     def thinking(self) -> Marks | None:
-        """The marks of its thinking, which is split off a vote."""
+        """The opening and closing mark around its thinking, which is split off a vote; None if it shows none."""
         ...
 
     @property
     def premise(self) -> bool:
-        """Whether it also says if an answer rejects the question's premise."""
+        """Whether the judge also says if an answer rejects the question's premise."""
         ...
 
 
@@ -136,7 +136,7 @@ def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
 
 
 def thinking_of(judge: str) -> Marks | None:
-    """Return the marks of a judge's thinking; None if it shows none."""
+    """Return the opening and closing mark around a judge's thinking; None if it shows none."""
     entry = load_judges().get(judge)
     return entry.thinking if entry else None
 

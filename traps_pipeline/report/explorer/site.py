@@ -329,7 +329,7 @@ def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
 
 @cache
 def script() -> str:
-    """Return the text of the explorer's script: bundled libraries and our sources. Raises TrapsError if a bundle changed."""
+    """Return the text of the explorer's script, libraries included. Raises TrapsError if a library was changed."""
     library = LIBRARY.read_bytes()
     expected_sha256 = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
     if hashlib.sha256(library).hexdigest() != expected_sha256:

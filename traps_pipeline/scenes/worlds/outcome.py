@@ -98,7 +98,7 @@ def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the geoms of some bodies, and of those that are soft."""
+    """Return the names of the geoms that belong to any of these bodies, and of the soft ones among them."""
     soft_bodies = flexes(model)
     ids = {model.body(name).id for name in bodies if name not in soft_bodies}
     geoms = (model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)

@@ -145,12 +145,12 @@ class World:
 
     @property
     def concealed_geoms(self) -> tuple[str, ...]:
-        """Geoms of decisive bodies and the hidden element, which the void must not show."""
+        """The names of the geoms of decisive bodies and the hidden element, which the void must not show."""
         return (*decisive_geoms(self.model, self.scene.decisive), *self.scene.hidden)
 
     @property
     def closed_geoms(self) -> tuple[str, ...]:
-        """Geoms hidden by closing: the concealed ones, or all that move (cut scene)."""
+        """The names of the geoms that closing must hide: concealed ones, or in a cut scene all that move."""
         return moving_geoms(self.model) if self.occluder is None else self.concealed_geoms
 
     @cached_property
@@ -217,7 +217,7 @@ class World:
 
     @property
     def void_frames(self) -> list[np.ndarray]:
-        """The frames of the world behind the occluder of its void."""
+        """The frames, drawn with the void's occluder, that pixel evidence looks at."""
         return self.behind_occluder(self.evidence_frames)
 
     def closed_renderer(self) -> Renderer:
