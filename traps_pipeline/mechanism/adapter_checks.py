@@ -56,7 +56,7 @@ class Subject:
 
     @property
     def layer(self) -> int:
-        """The layer in the middle of the model, on which adapters are tried."""
+        """The index of the middle layer, on which adapters are tried."""
         return max(1, self.model.n_layers // 2)
 
     def steered(self, *alphas: float) -> Steering:
@@ -67,7 +67,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Check:
-    """A promise of an adapter, and the function that checks it.
+    """A property that an adapter must have, and the function that checks it.
 
     run: returns the observation in a few words; raises TrapsError if the promise is broken. exact: the check needs
     float32, since it allows hardly any rounding.

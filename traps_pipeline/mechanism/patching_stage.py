@@ -60,7 +60,7 @@ Cell = tuple[str, Site, int, str]  # patched side, site, layer, group
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """A side of a pair: its prompt and its own groups of positions."""
+    """The control or the void of a pair: its prompt, and groups of the positions of its tokens."""
 
     prompt: Prompt
     parts: Mapping[str, np.ndarray]
@@ -85,7 +85,7 @@ def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
 
 
 class Pairs:
-    """The patched pairs of a dataset, and the files with each pair's results."""
+    """The pairs of a dataset that are patched, with the files of each pair's results."""
 
     def __init__(
         self,
@@ -244,7 +244,7 @@ def _has_same_form(target: Mapping[str, np.ndarray], source: Mapping[str, np.nda
 
 
 def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
-    """Return a pair's groups of positions, (T,) bool; None if prompts differ in form.
+    """Return by name a pair's groups of token positions, (T,) bool; None if prompts differ in form.
 
     A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
     all count as changed.
@@ -260,7 +260,7 @@ def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
 
 
 def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
-    """Return each direction's cells with the largest estimates over all pairs.
+    """Return the sites, layers and groups of each direction with the largest estimates over all pairs.
 
     Only some layers count, at equal steps. All positions of the residual stream together are left out; their effect is
     1 by construction.
@@ -344,7 +344,7 @@ def effect_of(
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
-    """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
+    """Return the times (N,) s of a clip's shown frames: its own, or another clip's, spread evenly."""
     if times is None or times == clip:
         return shown.times_s
     sampled_s = pick_frames(times, spec).times_s
