@@ -31,6 +31,7 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
+    """Release money that is reserved for calls never sent, or list what may be released."""
     from traps_pipeline.base.terminal import text_table
     from traps_pipeline.models.money.spending import releasable, release_money
 
@@ -51,6 +52,7 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> int:
+    """Write the study's ledger rows to a file, and print their number."""
     from traps_pipeline.ledger.row_transfer import export_ledger
 
     count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute(), print)
@@ -61,6 +63,7 @@ def export(arguments: argparse.Namespace) -> int:
 
 
 def import_(arguments: argparse.Namespace) -> int:
+    """Read ledger rows from a file into the study's ledger, and print their number."""
     from traps_pipeline.ledger.row_transfer import import_ledger
 
     workspace = open_workspace(arguments)
@@ -70,6 +73,7 @@ def import_(arguments: argparse.Namespace) -> int:
 
 
 def move(arguments: argparse.Namespace) -> int:
+    """Move the study's files and history to an object store."""
     from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
     from traps_pipeline.storage.place import parse_place

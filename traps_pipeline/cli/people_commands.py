@@ -42,6 +42,7 @@ def add(commands: Commands) -> None:
 
 
 def review(arguments: argparse.Namespace) -> int:
+    """Serve the pages on which a reviewer decides about scenarios, until Ctrl-C."""
     require_extra("web")
     from traps_pipeline.base.paths import require_own_corrections
     from traps_pipeline.servers.review import Review, review_app
@@ -59,6 +60,7 @@ def review(arguments: argparse.Namespace) -> int:
 
 
 def annotate(arguments: argparse.Namespace) -> int:
+    """Serve the pages on which people label clips and answers, until Ctrl-C."""
     require_extra("web")
     from traps_pipeline.servers.annotate import Annotation, annotation_app
     from traps_pipeline.servers.server import serve

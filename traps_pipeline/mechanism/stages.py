@@ -203,7 +203,7 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
 def direction_pairs(
     settings: MechanismSettings, dataset: str, items: pd.DataFrame
 ) -> tuple[list[str], list[int], list[int]]:
-    """Return a direction's scenarios, and row numbers of their voids and controls. Raises TrapsError without steering."""
+    """Return a direction's scenarios, and rows of their voids and controls. Raises TrapsError without steering."""
     steering = settings.steering
     if steering is None:
         raise TrapsError(

@@ -1,4 +1,4 @@
-"""Declare what an entry shares or repeats: limits of calls, an account, prices, groups."""
+"""Declare settings that entries share or repeat: limits of calls, an account, prices, groups."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from traps_pipeline.base.redaction import redact_environment_variable
 
 
 class Limits(BaseModel):
-    """Limits of calls to a participant; none of them is in the ledger key."""
+    """The limits of calls to a participant; none of them is in the ledger key."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     concurrency: int = Field(default=24, ge=1, description="calls at once")
@@ -57,7 +57,7 @@ class Prices(BaseModel):
 
 
 class Groups(BaseModel):
-    """A model's groups in the paper, by which tables select rows."""
+    """The groups of a model in the paper, by which tables select rows."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     family: str

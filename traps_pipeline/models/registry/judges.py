@@ -61,7 +61,7 @@ _WITH_PREMISE = structured_output("abstention", **_ABSTENTION, rejects_premise={
 
 
 class Judge(typing.Protocol):
-    """The properties of a judge that decide its votes, wherever it is defined."""
+    """The properties of a judge that decide its votes, whether of the registry or of a package."""
 
     @property
     def id(self) -> str:
@@ -95,7 +95,7 @@ class Judge(typing.Protocol):
 
 
 def vote_prompt(seat: Judge, task: Task) -> str:
-    """Return a task's system prompt: the paper's, and ours about the premise if asked."""
+    """Return a task's system prompt: the paper's, and ours about the premise if the judge is asked."""
     text = load_prompt(f"judge_{task}")
     return f"{text}\n\n{load_prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
 
@@ -170,7 +170,7 @@ def is_of_rules(panel: str) -> bool:
 
 
 def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
-    """Return every panel's judges, unchecked. Raises TrapsError without `panels:`."""
+    """Return each panel's judges by the panel's name, unchecked. Raises TrapsError without `panels:`."""
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
@@ -178,7 +178,7 @@ def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
 
 
 def panel_advice(path: Path = JUDGES_FILE) -> str:
-    """Return instructions for a command without a panel."""
+    """Return a sentence that says how to name a panel, for a command without one."""
     return (
         f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "
         f"({RULES_PANEL} is for reference strategies)"

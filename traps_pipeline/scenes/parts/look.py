@@ -86,7 +86,7 @@ class Look:
 
 
 def look_of_draw(seed: int, family: str, number: int, parts: Collection[str]) -> Look | None:
-    """Return the look of a numbered draw of a family, drawn by itself."""
+    """Return the look of a numbered draw of a family, drawn independently of the scene."""
     return draw_look(np.random.default_rng([seed, *family.encode(), number, *b"look"]), parts)
 
 
@@ -129,7 +129,7 @@ def look_of(params: Any) -> Look | None:
 
 
 def fineness(params: Any) -> int:
-    """Return the factor by which a scene's frames are finer than 480x360."""
+    """Return the factor by which a scene's frames are larger than 480x360."""
     look = look_of(params)
     return 1 if look is None else SIZES[look.size]
 

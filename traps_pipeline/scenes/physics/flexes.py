@@ -31,7 +31,7 @@ def carriers(model: mujoco.MjModel, flex: int) -> np.ndarray:
 
 
 def soft_body_mask(model: mujoco.MjModel) -> np.ndarray:
-    """Return whether each body only carries a soft body, (nbody,) bool."""
+    """Return whether each body does nothing but carry a soft body, (nbody,) bool."""
     mask = np.zeros(model.nbody, bool)
     for flex in range(model.nflex):
         mask[carriers(model, flex)] = True

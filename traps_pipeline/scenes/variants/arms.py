@@ -1,4 +1,4 @@
-"""Define arms: clips and questions that take one shortcut away (docs/arms.md).
+"""Define arms: datasets beside the pairs whose clips and questions take one shortcut away (docs/arms.md).
 
 A shortcut tells control from void without looking at what happens: an occluder in the first frame, a short clip, the
 words of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be
@@ -36,7 +36,7 @@ LEAD_FRAMES = (5, 3, 2, 1)  # frames before commitment at which it may cut, the 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A record with its two worlds, and frames that several arms need."""
+    """A record with the worlds of its control and its twin, and frames that several arms need."""
 
     spec: SceneSpec
     control: World
@@ -54,26 +54,26 @@ class Scenario:
 
     @cached_property
     def control_frames(self) -> list[np.ndarray]:
-        """The control without the occluder that may close it."""
+        """The frames of the control without the occluder that may close it."""
         with self.control.renderer() as renderer:
             return list(renderer.frames(self.control.qpos))
 
     @cached_property
     def twin_frames(self) -> list[np.ndarray]:
-        """The other world without any occluder."""
+        """The frames of the twin without any occluder."""
         with self.twin.renderer() as renderer:
             return list(renderer.frames(self.twin.qpos))
 
     @property
     def void_frames(self) -> list[np.ndarray]:
-        """The void: with its occluder, or up to its cut."""
+        """The frames of the void: with its occluder, or up to its cut."""
         if self.control.occluder is not None:
             return self.control.void_frames
         return self.control_frames[: self.spec.void["cut_frame"]]
 
     @property
     def sampled(self) -> slice:
-        """The frames that the 5 FPS sample shows."""
+        """The indices of the frames that the 5 FPS sample shows."""
         return slice(0, None, self.fps // checks.SAMPLED_FPS)
 
 
@@ -116,7 +116,7 @@ class Arm:
 
 
 def questions_to_answer(spec: SceneSpec) -> list[Question]:
-    """Return the record's question for the arm's clip, to be answered."""
+    """Return the record's question for the arm's clip, as the only one; it must be answered."""
     return [Question("control", spec.question, spec.ground_truth)]
 
 

@@ -33,13 +33,13 @@ def target_probability(spec: SceneSpec) -> float:
 
 
 def probabilities(counts: Counter[str | None]) -> dict[str, float]:
-    """Return the share of each answer among decided futures, the commonest first."""
+    """Return by answer its share among decided futures, the commonest first."""
     answers = {label: n for label, n in counts.most_common() if label is not None}
     return {label: n / sum(answers.values()) for label, n in answers.items()}
 
 
 def graded_cut(spec: SceneSpec, control: World) -> tuple[int, dict[str, Any]]:
-    """Return the cut nearest to the target probability. Raises Rejected.
+    """Return the frame and evidence of the cut nearest to the target probability. Raises Rejected.
 
     A cut ends with a frame that 5 frames a second show, not after the outcome is settled. The later it is, the more
     futures agree, so it is sought by halving.

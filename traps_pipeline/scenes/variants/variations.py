@@ -37,7 +37,7 @@ PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colo
 
 
 def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
-    """Return the scenario's question with `count` choices, and these. Raises Rejected.
+    """Return the scenario's question with `count` choices, and these choices. Raises Rejected.
 
     The answer and that of the twin, the other world behind the same void, are always among them, so that the void stays
     open; then come the question's own choices, and then colours that it does not name. Raises Rejected where the
@@ -98,7 +98,7 @@ def _offered(scenario: Scenario) -> Take:
 
 @dataclass(frozen=True)
 class Look:
-    """An occluder's look. colour: RGB or None; alpha: 1 is opaque; wide: a factor."""
+    """The look of an occluder. colour: RGB or None; alpha: 1 is opaque; wide: a factor."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0

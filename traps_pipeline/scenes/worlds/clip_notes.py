@@ -14,7 +14,7 @@ from traps_pipeline.video.encode import DamagedClip, encode, frames_digest
 
 @dataclass(frozen=True)
 class Clip:
-    """An encoded clip. leaked_pixels: visible pixels of hidden things; None without occluder."""
+    """A clip's note: digest, size and length. leaked_pixels: visible pixels of hidden things; None without occluder."""
 
     file_sha256: str
     frames_sha256: str
@@ -37,7 +37,7 @@ def _seal_of(clip: Clip) -> str:
 
 
 def clip_note_path(clip: Path) -> Path:
-    """Return the path of a clip's note, JSON that is written last and vouches for it."""
+    """Return the path of a clip's note (JSON), which is written last and vouches for the clip."""
     return clip.with_suffix(".json")
 
 
