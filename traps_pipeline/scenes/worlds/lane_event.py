@@ -70,7 +70,7 @@ class LaneEvent:
         return np.concatenate([swept_points(self.model, self.qpos), *geom_corners(self.model).values(), *framed])
 
     def copied_geoms(self, body: str) -> list[str]:
-        """Return the names of the geoms that a body's double has: without the hidden element's, unless it has no other."""
+        """Return the geom names of a body's double: all but those of the hidden element, unless it has no other."""
         model, number = self.model, self.model.body(body).id
         names = [model.geom(int(i)).name for i in np.flatnonzero(model.geom_bodyid == number)]
         return [name for name in names if name not in self.scene.hidden] or names
