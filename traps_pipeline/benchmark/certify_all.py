@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.composition import composition_problems, load_comp
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import telling_numbers
 from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
-from traps_pipeline.benchmark.records import load_released, refuse_recorded, two_events_lines
+from traps_pipeline.benchmark.records import load_release, load_released, refuse_recorded, two_events_lines
 from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
@@ -50,6 +50,8 @@ def certify_all(
 
     Verdicts are cached in `cache_folder` by record and code, so that an interrupted call resumes.
     """
+    if (folder / "benchmark.yaml").is_file():
+        load_release(folder / "benchmark.yaml")  # refuses that of another version
     released_folder, lanes_folder = folder / "released", folder / "two_events" / "released"
     specs = [s for s in load_released(released_folder).values() if families is None or s.family in families]
     lines = two_events_lines(lanes_folder).values()

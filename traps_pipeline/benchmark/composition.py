@@ -3,6 +3,7 @@
 import uuid
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
@@ -53,12 +54,13 @@ def sample_benchmark(
     Existing records of the same seed and numbers stay: an interrupted sampling resumes.
     Raises TrapsError if a family cannot be filled, or does not support a setting of the difficulty.
     """
-    require_difficulty(counts, difficulty)
+    of_pairs = replace(difficulty, window_s=DEFAULT_DIFFICULTY.window_s)
+    require_difficulty(counts, of_pairs)
     with keep_workers():
-        for family, count in counts.items():
+        for family, count in ((family, count) for family, count in counts.items() if count):
             released = out / "released"
             tally = sample_family(
-                family, count, seed, released, look=look, difficulty=difficulty, workers=workers, report=report
+                family, count, seed, released, look=look, difficulty=of_pairs, workers=workers, report=report
             )
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
             report(f"{family}: {count} of {count_noun(tally.draws, 'draw')}; {reasons}")

@@ -14,7 +14,6 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.footage import FPS, Footage, UnusableFootage, read_footage
 from traps_pipeline.benchmark.recorded_pairs import Board, RecordedPair
 from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
-from traps_pipeline.scenes.parts.look import LINE_SHARE, OCCLUDERS, occluder_texture
 from traps_pipeline.scenes.worlds.clip_notes import clip_note_path, read_clip
 from traps_pipeline.video.encode import DamagedClip
 
@@ -148,6 +147,8 @@ def _covered(control: Footage, pair: RecordedPair, boards: Iterable[Board]) -> l
 
 def _panel(width: int, height: int, name: str) -> np.ndarray:
     """Return a board's picture, in a colour of the simulated ones: slats under a paler upper edge."""
+    from traps_pipeline.scenes.parts.look import LINE_SHARE, OCCLUDERS, occluder_texture  # takes long to import
+
     colours = [*OCCLUDERS.values()]
     colour = BOARD_TONE * np.array(colours[int(digest(name)[:8], 16) % len(colours)])
     down = np.arange(height) - height // 2

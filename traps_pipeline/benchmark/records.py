@@ -13,7 +13,7 @@ from pydantic_core import from_json
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
-from traps_pipeline.base.paths import RELEASED, SCENE_SPECS, TWO_EVENTS_RELEASED
+from traps_pipeline.base.paths import OWN_SPECS, RELEASED, SCENE_SPECS, SPECS_VARIABLE, TWO_EVENTS_RELEASED
 from traps_pipeline.base.yamlfile import check_line, faults_of, parse_yaml_model, read_unchecked_lines, read_yaml
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names
@@ -37,8 +37,14 @@ class Release(BaseModel):
 
 @cache
 def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
-    """Return name and version of the released benchmark."""
-    return parse_yaml_model(Release, read_yaml(path), path)
+    """Return name and version of the released benchmark. Raises TrapsError for another version of the package's own."""
+    release, own = (parse_yaml_model(Release, read_yaml(file), file) for file in (path, OWN_SPECS / "benchmark.yaml"))
+    if release.name == own.name and release.version != own.version:
+        raise TrapsError(
+            f"{path}: these are records of {release.name} {release.version}, and this is the package of {own.version}, "
+            f"which draws them otherwise: install the package of {release.version}, or unset {SPECS_VARIABLE}"
+        )
+    return release
 
 
 @dataclass(frozen=True)
@@ -70,8 +76,9 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
 
 @cache
 def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine[SceneSpec]]:
-    """Return the lines of the released records by id. Raises TrapsError with file and remedy."""
-    if records := _lines(folder, parse_record):
+    """Return lines of the released records by id; none beside two events alone. Raises TrapsError with remedy."""
+    records = _lines(folder, parse_record)
+    if records or two_events_lines(folder.parent / "two_events" / folder.name):
         return records
     raise TrapsError(
         f"{folder}: holds no released records; restore it from git or draw some with `traps benchmark sample`"
@@ -101,7 +108,7 @@ def _lines(folder: Path, parse: Callable[[str, str], Record]) -> dict[str, Relea
 
 def is_recorded(folder: Path = RELEASED) -> bool:
     """Return whether a benchmark's pairs are recorded videos; no benchmark has both kinds."""
-    return next(iter(released_lines(folder).values())).family == RECORDED
+    return any(line.family == RECORDED for line in released_lines(folder).values())
 
 
 def refuse_recorded(what: str, folder: Path = RELEASED) -> None:

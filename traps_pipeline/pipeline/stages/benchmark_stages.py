@@ -185,7 +185,7 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
     group="arms",
     parents=[scene_specs, videos, released_specs, corrections],  # records of two events are in no table before
     scheme=CATEGORY,
-    code="5",
+    code="6",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=ConcurrentBuild(_film, _seconds_of_filming),

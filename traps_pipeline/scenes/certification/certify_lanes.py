@@ -93,8 +93,8 @@ def _outcomes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
         if len({outcome.label for outcome, _ in outcomes}) < 2:
             raise Rejected(f"{LANES[k]}: the twin has the same outcome")
         settled.append(max(outcome.commit_frame for outcome, _ in outcomes))
-        if not lane.timetable.shows(settled[-1], len(world.qpos), world.physics.fps):
-            raise Rejected(f"{LANES[k]}: no window of a second shows the settled outcome")
+        if not lane.timetable.shows(settled[-1], len(world.qpos), world.physics.fps, lane.window_s):
+            raise Rejected(f"{LANES[k]}: no window of {lane.window_s:g} s shows the settled outcome")
     return {"settled_frames": settled}
 
 

@@ -46,12 +46,13 @@ class Difficulty:
     """The settings of difficulty with which scenarios are drawn.
 
     distractors: their number. speed: factor on the speed of all events. longer: rows, lanes and counts from the
-    longer ranges of their family.
+    longer ranges of their family. window_s: for how long two events show a settled outcome, at least; of pairs nothing.
     """
 
     distractors: int = 0
     speed: float = 1.0
     longer: bool = False
+    window_s: float = 1.0
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that differ from the defaults."""
@@ -70,6 +71,7 @@ def unsupported_settings(family: Family, difficulty: Difficulty) -> list[str]:
         "distractors": family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES,
         "speed": difficulty.speed <= MAX_SPEEDS.get(family.name, 1.0),
         "longer": vary.can_be_longer(family.params),
+        "window_s": False,
     }
     return [name for name in difficulty.settings() if not is_supported[name]]
 

@@ -177,6 +177,37 @@ def _first_moving_frame(frames: np.ndarray, comes: int, colour: np.ndarray) -> i
     return first
 
 
+def until_covered(frames: np.ndarray, n_before: int) -> np.ndarray:
+    """Return the frames before an occluder, and then those of its way in which it is before nothing that moves.
+
+    n_before: frames before it is in view. What it hides on its way is painted as it was before.
+    """
+    seen = [*frames[:n_before]]
+    for frame in frames[n_before : n_before + COMES_FRAMES] if n_before > 1 else ():
+        is_new = _levels(frame, seen[-1]) > CHANGED_LEVELS
+        board = largest_board(np.where(is_new[..., None], frame, 255), COMING_PX)
+        if board is None:
+            break
+        x, y, width, height = board.box
+        part = np.s_[max(0, y - 2) : y + height + 2, max(0, x - 2) : x + width + 2]
+        moved = motion_mask(np.stack(seen[-2:])) & ~_is_shaded(seen[-2], seen[-1])
+        _, names = cv2.connectedComponents(moved.astype(np.uint8))
+        sizes, covered = np.bincount(names.ravel()), np.bincount(names[part].ravel(), minlength=names.max() + 1)
+        if ((sizes >= MOVED_PX) & (covered > sizes / 2))[1:].any():
+            break
+        seen.append(frame.copy())
+        seen[-1][part] = seen[-2][part]
+    return np.stack(seen)
+
+
+def _is_shaded(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the mask of pixels that turned darker and kept their hue, bool (H, W), as in a shadow."""
+    old, new = before.astype(np.float32) + 1, after.astype(np.float32) + 1
+    light = (new * old).sum(axis=2) / (old * old).sum(axis=2)
+    error = np.linalg.norm(new - light[..., None] * old, axis=2) / np.linalg.norm(old, axis=2)
+    return (light < 1) & (error < 0.06)
+
+
 def after_occluder(frames: np.ndarray) -> np.ndarray:
     """Return the frames after an occluder that stood from the first on has gone."""
     return before_occluder(frames[::-1])[::-1]

@@ -43,7 +43,7 @@ def choices_in(text: str) -> tuple[str, ...]:
     return tuple(re.split(r", | or ", text))
 
 
-LANE_QUESTION = "In the lane with the {strip} strip, leaving its bench aside: {question}"  # of two events
+LANE_QUESTION = "In the lane with the {strip} strip, not on its grey bench: {question}"  # of two events
 
 
 def lane_question(strip: str, question: str) -> str:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from traps_pipeline.scenes.physics.kit import Box, Vec3, View
+if TYPE_CHECKING:
+    from traps_pipeline.scenes.physics.kit import Box, View
 
+Vec3 = tuple[float, float, float]  # the kit's, which records of boards are checked by, and which brings the physics
 WIDTH, HEIGHT = 480, 360
 WIDE = 640  # width of a clip of two lanes, in the same height
 FRAME_FILL = 0.92  # share of the half-frame that the fitted points may use
