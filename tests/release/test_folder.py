@@ -183,7 +183,7 @@ def test_mlcroissant_validates_its_description_and_reads_every_record(released: 
 SIGN = """
 import sys
 from pathlib import Path
-from traps_pipeline.release.signing import signature_problem, sign
+from traps_pipeline.release.signing import sign, signature_problem
 folder, private, public, other = map(Path, sys.argv[1:])
 for refused in (lambda: sign(folder, public), lambda: signature_problem(folder, public)):
     try:
