@@ -1,9 +1,8 @@
 """Remove keys from text before it is printed, logged, stored or displayed.
 
-Secrets are the values of environment variables that hold keys: those that a registry names
-(`redact_environment_variable`), those that a run has read (`remember`), and those whose names say so. They are found
-verbatim, in any case, escaped, percent-encoded, in base64 or in hexadecimal, also when white space, quotes or line
-breaks split them, and when either end is cut off.
+Secrets are the values of environment variables that hold keys: those that a registry names, those that a run has read
+(`remember`), and those whose names say so. They are found verbatim, in any case, escaped, percent-encoded, in base64 or
+in hexadecimal, also when white space, quotes or line breaks split them, and when either end is cut off.
 """
 
 import logging

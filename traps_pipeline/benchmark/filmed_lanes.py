@@ -71,9 +71,8 @@ def film_lanes(
     rows: list[Row] = [{"scenario_id": id_} for id_ in specs]
 
     def files(row: Row) -> list[Path]:
-        return [
-            file for clip in lane_paths(workspace, specs[row["scenario_id"]]) for file in (clip, clip_note_path(clip))
-        ]
+        clips = lane_paths(workspace, specs[row["scenario_id"]])
+        return [file for clip in clips for file in (clip, clip_note_path(clip))]
 
     def missing(rows: Sequence[Row]) -> list[Row]:
         existing = workspace.store.there(file for row in rows for file in files(row))

@@ -31,7 +31,6 @@ def add(commands: Commands) -> None:
 
 
 def release(arguments: argparse.Namespace) -> int:
-    """Release money that is reserved for calls never sent, or list what may be released."""
     from traps_pipeline.base.terminal import text_table
     from traps_pipeline.models.money.spending import releasable, release_money
 
@@ -73,7 +72,6 @@ def import_(arguments: argparse.Namespace) -> int:
 
 
 def move(arguments: argparse.Namespace) -> int:
-    """Move the study's files and history to an object store."""
     from traps_pipeline.base.progress import use_progress
     from traps_pipeline.cli.printed_progress import make_progress
     from traps_pipeline.storage.place import parse_place

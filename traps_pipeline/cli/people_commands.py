@@ -60,7 +60,6 @@ def review(arguments: argparse.Namespace) -> int:
 
 
 def annotate(arguments: argparse.Namespace) -> int:
-    """Serve the pages on which people label clips and answers, until Ctrl-C."""
     require_extra("web")
     from traps_pipeline.servers.annotate import Annotation, annotation_app
     from traps_pipeline.servers.server import serve

@@ -80,7 +80,7 @@ class Occluder:
 
     def corners(self) -> np.ndarray:
         """Return the eight corners in the world, shape (8, 3)."""
-        local = Box(tuple(-h for h in self.half), self.half).corners()  # type: ignore[arg-type]
+        local = (2 * np.indices((2, 2, 2)).reshape(3, 8).T - 1) * self.half  # from low to high, the last axis fastest
         c, s = np.cos(np.radians(self.yaw_deg)), np.sin(np.radians(self.yaw_deg))
         return local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array(self.centre)
 

@@ -243,9 +243,8 @@ def _variation(name: str) -> Arm:
     if name in OCCLUDER_LOOKS:
         return Arm(name, _CHANGES[name], _SAME_VOID, _must_abstain, _FILMED[name])
     if name in OCCLUDER_DOSES:
-        return Arm(
-            name, f"the occluder has alpha {_ALPHAS[name]:g}", _SEEN_THROUGH, questions_to_answer, _sheer(_ALPHAS[name])
-        )
+        alpha = _ALPHAS[name]
+        return Arm(name, f"the occluder has alpha {alpha:g}", _SEEN_THROUGH, questions_to_answer, _sheer(alpha))
     promises = {
         "frames_later": f"the last {END_S:g} s as shown then show the settled outcome legibly; a void hides it in all",
         "frames_few": "that of the pair, which holds for this rate",

@@ -51,18 +51,16 @@ def read_clip(path: Path) -> Clip | None:
 
 def read_note(path: Path) -> Clip | None:
     """Return the content of a clip's note, None if there is none. Raises DamagedClip."""
-    if not clip_note_path(path).is_file():
+    if not (note_path := clip_note_path(path)).is_file():
         return None
     try:
-        note = json.loads(clip_note_path(path).read_text(encoding="utf-8"))
+        note = json.loads(note_path.read_text(encoding="utf-8"))
         seal = note.pop(_SEAL, None)  # notes of version 0.1.0 have none
         clip = Clip(**note)
         if seal not in (None, _seal_of(clip)):
             raise ValueError("it was altered")
     except (ValueError, TypeError, AttributeError) as error:
-        raise DamagedClip(
-            f"{clip_note_path(path)}: is not what was written ({error}); delete it and run again"
-        ) from error
+        raise DamagedClip(f"{note_path}: is not what was written ({error}); delete it and run again") from error
     return clip
 
 
