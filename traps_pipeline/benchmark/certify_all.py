@@ -30,7 +30,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 @dataclass(frozen=True)
 class Case:
-    """A record to certify, its trajectories' file, and the file for its verdict."""
+    """A record to certify, with the paths of its trajectories and of its cached verdict."""
 
     spec: SceneSpec | TwoEventsSpec
     trajectory: Path
@@ -112,7 +112,7 @@ def judge(case: Case) -> Verdict:
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
-    """Return families of 100+ cut clips whose state at the cut predicts the outcome."""
+    """Return in words the families of 100+ cut clips whose state at the cut predicts the outcome."""
     states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
@@ -132,7 +132,7 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
 
 
 def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
-    """Return a table as lines of text, one line per family.
+    """Return a table of verdicts as text, one line per family.
 
     Columns: scenarios, passed, rejected draws, entropy of the futures and accuracy of the best guess, margins, twins,
     CPU seconds.

@@ -79,7 +79,7 @@ def name_benchmark(out: Path, name: str) -> None:
 
 
 def composition_problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """Check all records together (numbers against `counts`); return problems in words."""
+    """Return in words what is wrong with all records together, and with their numbers against `counts`."""
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         families[spec.family].append(spec)
@@ -129,7 +129,7 @@ def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
 
 
 def repeated(keys: Iterable[tuple[str, str]], problem: str) -> list[str]:
-    """Return a problem for each key that several scenarios have. keys: key and scenario id."""
+    """Return a sentence for each key that several scenarios share. keys: key and scenario id."""
     owners: defaultdict[str, list[str]] = defaultdict(list)
     for key, scenario_id in keys:
         owners[key].append(scenario_id)
@@ -137,7 +137,7 @@ def repeated(keys: Iterable[tuple[str, str]], problem: str) -> list[str]:
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:
-    """Return the accuracy of each sub-scenario's commonest answer, mean of taxonomies."""
+    """Return the accuracy of answering each sub-scenario's commonest answer, mean of taxonomies."""
     commonest = commonest_answers([spec.model_dump(mode="json") for spec in specs])
     shares = []
     for taxonomy in ("occlusion", "chaotic"):

@@ -35,7 +35,7 @@ Sign = Callable[..., Correction]
 
 
 class DecidedMeanwhile(TrapsError):
-    """Another reviewer has decided about the scenario since this one looked at it."""
+    """Raised where another reviewer has decided about a scenario since this one looked at it."""
 
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
@@ -60,7 +60,7 @@ def save_decision(correction: Correction, n_seen: int, folder: Path = CORRECTION
 
 
 def undo_decision(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
-    """Append decisions that take back the last one about a scenario.
+    """Append decisions that cancel the last one about a scenario.
 
     Raises DecidedMeanwhile as `save_decision` does, and TrapsError if there is no decision to take back.
     """

@@ -250,7 +250,7 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
 
 def _redraw_problems(published: Commitment, problems: list[str], specs: Specs | None, drawn: Specs) -> list[str]:
     """Return the problems of drawn scenes, and whether only their last digits differ."""
-    from traps_pipeline.release.commitment import arithmetic_differences, is_same_scene
+    from traps_pipeline.release.commitment import environment_differences, is_same_scene
 
     if (
         problems
@@ -258,6 +258,6 @@ def _redraw_problems(published: Commitment, problems: list[str], specs: Specs | 
         and {*specs} == {*drawn}
         and all(is_same_scene(specs[i], drawn[i]) for i in specs)
     ):
-        machine_difference = arithmetic_differences(published) or "another kind of CPU"
+        machine_difference = environment_differences(published) or "another kind of CPU"
         problems.append(f"all scenes are the same but for the last digits of their simulation ({machine_difference})")
     return problems

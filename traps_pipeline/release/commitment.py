@@ -249,7 +249,7 @@ def is_same_scene(spec: SceneSpec | TwoEventsSpec, other: SceneSpec | TwoEventsS
     return spec.model_dump(exclude=excluded) == other.model_dump(exclude=excluded)
 
 
-def arithmetic_differences(commitment: Commitment) -> str:
+def environment_differences(commitment: Commitment) -> str:
     """Return how machine and libraries differ from the commitment's, if they do."""
     own_machine = _arithmetic()
     names = [name for name in own_machine if commitment.made_with.get(name) != own_machine[name]]

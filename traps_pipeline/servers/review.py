@@ -126,7 +126,7 @@ class Review:
         return queue(name, list(self.specs), self.reviewed(), self.flags)
 
     def decide(self, sent: Decision) -> None:
-        """Append a decision. Raises NotFound, Refused and Conflict."""
+        """Append a reviewer's decision about a scenario to the corrections. Raises NotFound, Refused and Conflict."""
         spec = self.spec(sent.scenario_id)
         correction, decision_count = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
         if sent.action == "add":

@@ -17,7 +17,7 @@ from traps_pipeline.models.request import Outcome, Request
 
 @dataclass
 class EvaluationState:
-    """What the cells of an evaluation share. reported: places of the ledger. is_over: no call is sent any more."""
+    """The state that an evaluation's cells share. reported: places of the ledger. is_over: no call is sent any more."""
 
     participants: Participants
     budget: Budget
@@ -34,7 +34,7 @@ class EvaluationState:
 
 @dataclass
 class Asking:
-    """Workers over a cell's missing requests. again: what to record of a call that is repeated to settle it."""
+    """The workers that ask a cell's missing requests. again: what to record of a call that is repeated to settle it."""
 
     its: EvaluationState
     missing: Sequence[Request]

@@ -1,4 +1,4 @@
-"""Draw scenarios of two events: two draws of a family that differ in nothing but shape, place and outcome."""
+"""Draw scenarios of two events: two draws of a family that differ only in shape, place and outcome."""
 
 import json
 from collections import Counter
@@ -58,7 +58,7 @@ def lane_families() -> list[str]:
 
 @dataclass(frozen=True)
 class DrawnLanes:
-    """A record and the trajectories, by name: of its world, and of those with the left and the right lane's twin."""
+    """A record of two events, and the trajectories by name: of its world, and of those where one lane differs."""
 
     spec: TwoEventsSpec
     worlds: Mapping[str, np.ndarray]
@@ -129,7 +129,7 @@ def draw_worlds(
     *,
     is_alike: bool = True,
 ) -> tuple[tuple[TwoLanes, TwoLanes, TwoLanes], Wording]:
-    """Return a world, those with the left and the right lane's twin, and the words for both. Raises Rejected.
+    """Return a world of two lanes, those where one lane has its twin, and the words for both. Raises Rejected.
 
     Nothing is certified. is_alike: doubles have about as many pixels as the things, which are drawn for it.
     """
@@ -214,7 +214,7 @@ def _with_distractors(pair: Pair, wording: Wording, difficulty: Difficulty, rng:
 
 
 def is_turn_of_earlier(family: str, number: int, lane: int, seed: int) -> bool:
-    """Return whether a lane shows the earlier of its two answers, as half of the lanes in every eight scenarios do."""
+    """Return whether a lane must end in the earlier of its two answers, as half of every eight scenarios do."""
     block, place = divmod(number - 1, TURNS)
     turns = np.random.default_rng([seed, *family.encode(), block, TURNS]).permutation(len(LANES) * TURNS) % 2
     return bool(turns[len(LANES) * place + lane])
@@ -267,7 +267,7 @@ def narrowed(lane: Lane, settled: int, physics: Physics, window_s: float, rng: n
 
 
 def draw_timetable(rng: np.random.Generator, settled: int, n_frames: int, fps: int) -> Timetable | None:
-    """Draw a timetable that shows what has settled by a frame; None if none was found.
+    """Return a random timetable of a board that shows what has settled by a frame; None if none was found.
 
     In a half of them each the board stands in the first frame, and in the last; and it comes or goes at least once.
     """

@@ -35,7 +35,7 @@ _HUES: Mapping[str, tuple[float, float, float, float]] = {
 
 @dataclass(frozen=True)
 class Blob:
-    """A connected region: centroid, box (x, y, width, height) and area, in pixels."""
+    """A connected region of pixels: centroid, box (x, y, width, height) and area, in pixels."""
 
     x: float
     y: float
@@ -71,7 +71,7 @@ def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
 
 
 def blobs(mask: np.ndarray, min_area: int = 12) -> list[Blob]:
-    """Return connected regions of a mask, largest first."""
+    """Return the connected regions of a mask, largest first."""
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     contours = [
         Blob(
@@ -106,7 +106,7 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
 def slanting_edges(
     frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two masks: a part's edges that fall to the left, and to the right.
+    """Return the masks of a part's edges that fall to the left, and to the right.
 
     slants: least and greatest slope, in rows a column.
     """
@@ -230,7 +230,7 @@ def _levels(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def without_flags(frames: np.ndarray) -> np.ndarray:
-    """Return frames (F, H, W, 3) whose flags are painted over with the colours beside them.
+    """Return frames (F, H, W, 3) whose flags (signs over hidden things) are painted over.
 
     A flag is a small upright patch of one colour at the top of a thin dark mast, to its right; both stand still. Of a
     black flag the mast is told apart only below.

@@ -87,7 +87,7 @@ class Occluder:
 
 @dataclass(frozen=True)
 class Closing:
-    """A control's end: from this frame on an occluder stands before the outcome."""
+    """The end of a control: from this frame on an occluder stands before the outcome."""
 
     frame: int
     occluder: Occluder
@@ -160,7 +160,7 @@ def fit_occluder(camera: Camera, cover: Box, stage: np.ndarray | None = None) ->
 
 
 def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Occluder | None]:
-    """Fit a camera, and an occluder in its frame; return both."""
+    """Return a camera that has all points in frame, and an occluder in its frame."""
     camera, occluder = fit_camera(view, points), None
     if cover is None:
         return camera, None

@@ -30,7 +30,7 @@ Path = tuple[tuple[float, float], ...]  # along and above the bench's middle, in
 
 @dataclass(frozen=True)
 class Lane:
-    """What is drawn of a lane.
+    """The drawn settings of a lane, one of two strips of the picture that each show an event.
 
     strip: its colour. bench_above: whether the bench is above the scene in the picture. bench_at: where it is along the
     lane, 0 to 1. mirrored: whether doubles come from the other side than what they are doubles of. rests_at: how far
@@ -53,7 +53,7 @@ class Lane:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things of a lane are, in the world.
+    """The places of a lane's parts in the world.
 
     shift: of the family's own scene. bench: the middle of the bench's upper face. bench_half: across, and in depth.
     boards: before the scene, and before the bench. paths: of the middle of each double's foot.

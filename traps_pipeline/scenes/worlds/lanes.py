@@ -130,7 +130,7 @@ class TwoLanes:
         return decisive_geoms(self.model, [f"{LANES[lane]} {body}" for body in self.events[lane].scene.decisive])
 
     def hidden_element(self, lane: int) -> tuple[str, ...]:
-        """Return the names of the geoms of a lane's hidden element that are no decisive ones."""
+        """Return the names of the geoms of a lane's hidden element that are not decisive ones."""
         names = [f"{LANES[lane]} {name}" for name in self.events[lane].scene.hidden]
         return tuple(name for name in names if name not in self.decisive(lane))
 

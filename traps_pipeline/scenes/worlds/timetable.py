@@ -1,4 +1,4 @@
-"""Let boards stand, come and go: by a timetable, and always for a window that shows what they stood before."""
+"""Decide when the boards of a lane stand, come and go, and when they show what they hide."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ WINDOW_SHOWN = 2  # frames of such a window that each model is shown, at least
 
 @dataclass(frozen=True)
 class Timetable:
-    """When a board stands: spans of frames [start, stop), ascending, with a move before and after each.
+    """The times at which a board stands: spans of frames [start, stop), with a move before and after each.
 
     A span that begins at frame 0, or ends with the clip, has no move there.
     """
