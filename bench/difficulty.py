@@ -4,9 +4,10 @@ The *tracker* is told the exact place of everything that moves in each frame tha
 the scene, and its colour up to those easily taken for each other, but neither shape nor name. It takes a thing to be
 the nearest one of its colour in the picture, from frame to frame, and reads the outcome of what it follows as the
 record does. First it follows the released lanes, as they are and with other timetables: the board stands but for a
-window of some length, at any time after the outcome settled. With `--levels` scenarios are drawn, certified and filmed
-as `traps benchmark sample --two-events` does with settings; the *observer* reads 25 frames by classical vision, too. By
-default these are of all families that take twice the speed.
+window of some length, at any time after the outcome settled. `--records` names others, such as those of the hard level;
+with `--film` the *observer* reads 25 frames of them by classical vision, too. With `--levels` scenarios are drawn,
+certified, filmed and read as `traps benchmark sample --two-events` does with settings, by default of all families that
+take twice the speed.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
 from traps_pipeline.scenes.worlds.outcome import decisive_geoms, read_outcome
-from traps_pipeline.scenes.worlds.timetable import MOVES_FRAMES, Timetable
+from traps_pipeline.scenes.worlds.timetable import Timetable
 from traps_pipeline.video.encode import encode
 
 LEVELS: Mapping[str, Difficulty] = {
@@ -50,6 +51,7 @@ LEVELS: Mapping[str, Difficulty] = {
     "both": Difficulty(distractors=3, speed=2.0),
     "longer": Difficulty(longer=True),
     "all": Difficulty(distractors=3, speed=2.0, longer=True),
+    "hard": Difficulty(window_s=0.2),
 }
 RATES = (10, 5, 2, 1)  # frames a second that the tracker is shown
 WINDOWS_S = (1.0, 0.5, 0.3, 0.2)
@@ -70,6 +72,7 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", default=fast_families(), help="default: that take twice the speed")
     parser.add_argument("--levels", nargs="*", choices=LEVELS, default=[])
     parser.add_argument("--records", type=Path, default=TWO_EVENTS_RELEASED)
+    parser.add_argument("--film", action="store_true", help="let the observer read the records, too")
     parser.add_argument("--count", type=int, default=2, help="scenarios of each family and level")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)
@@ -77,7 +80,8 @@ def main() -> None:
     print(f"{'level':12} family              lanes  {' '.join(f'{rate:3d}/s' for rate in RATES)}  observer")
     print_windows([line.spec for line in two_events_lines(arguments.records).values()], arguments)
     for level in arguments.levels:
-        admitted = [name for name in arguments.families if not unsupported_settings(get_family(name), LEVELS[level])]
+        of_scene = replace(LEVELS[level], window_s=LEVELS["usual"].window_s)
+        admitted = [name for name in arguments.families if not unsupported_settings(get_family(name), of_scene)]
         jobs = [(level, name, number, arguments.seed) for name in admitted for number in range(1, arguments.count + 1)]
         reads = list[Read]()
         for (_, family, *_), lanes in run_in_order(read_lanes, jobs, arguments.workers):
@@ -102,15 +106,16 @@ def print_row(level: str, family: str, reads: Sequence[Read]) -> None:
 
 def print_windows(specs: Sequence[TwoEventsSpec], arguments: argparse.Namespace) -> None:
     """Print what the tracker reads of released lanes, as they are and by windows."""
-    jobs = [(spec, arguments.records) for spec in specs if spec.family in arguments.families or not arguments.quick]
+    admitted = [spec for spec in specs if spec.family in arguments.families or not arguments.quick]
+    jobs = [(spec, arguments.records, arguments.film) for spec in admitted]
     read = [rows for _, rows in run_in_order(read_windows, jobs, arguments.workers)]
-    for k, title in enumerate(("as released", *(f"{window:g} s" for window in WINDOWS_S))):
+    for k, title in enumerate(("as they are", *(f"{window:g} s" for window in WINDOWS_S))):
         print_row(title, "all", [one for rows in read for one in rows[k]])
 
 
-def read_windows(job: tuple[TwoEventsSpec, Path]) -> list[list[Read]]:
+def read_windows(job: tuple[TwoEventsSpec, Path, bool]) -> list[list[Read]]:
     """Return what is read of both lanes of a record: with its own timetables, then with each of WINDOWS_S."""
-    spec, records = job
+    spec, records, film = job
     world = spec.world(trajectories_of(spec, records / "trajectories" / f"{spec.scenario_id}.npz")["qpos"])
     n_frames, rng = world.physics.n_frames, np.random.default_rng([*spec.scenario_id.encode()])
     reads = []
@@ -120,10 +125,12 @@ def read_windows(job: tuple[TwoEventsSpec, Path]) -> list[list[Read]]:
             timetable = record.lane.timetable
             if window is not None:
                 first = int(rng.integers(settled, n_frames - window + 1))
-                timetable = Timetable(((0, first - MOVES_FRAMES + 1), (first + window + MOVES_FRAMES - 1, n_frames)))
+                timetable = Timetable.of_window(first, window, n_frames)
             lanes.append(Read(record.ground_truth, tracked(world, k, timetable)))
         reads.append(lanes)
-    return reads
+    seen = observed(spec, world) if film else ()
+    filmed = [replace(one, observer=said, is_filmed=True) for one, said in zip(reads[0], seen, strict=False)]
+    return [filmed or reads[0], *reads[1:]]
 
 
 def read_lanes(job: tuple[str, str, int, int]) -> list[Read]:
@@ -132,14 +139,19 @@ def read_lanes(job: tuple[str, str, int, int]) -> list[Read]:
     *_, drawn = draw_two_events(family, number, seed, LEVELS[level])
     if not isinstance(drawn, DrawnLanes):
         return []
-    world, reads = drawn.spec.world(drawn.worlds["qpos"]), []
+    world = drawn.spec.world(drawn.worlds["qpos"])
+    return [
+        Read(record.ground_truth, tracked(world, k, record.lane.timetable), said, is_filmed=True)
+        for k, (record, said) in enumerate(zip(drawn.spec.lanes, observed(drawn.spec, world), strict=True))
+    ]
+
+
+def observed(spec: TwoEventsSpec, world: TwoLanes) -> list[str | None]:
+    """Return what the observer reads of both lanes in the clip that hides neither."""
     with TemporaryDirectory() as folder, Renderer(world.model, world.camera) as renderer:
         clip = Path(folder) / "neither.mp4"
         encode([*renderer.frames(world.clip(CLIPS["neither"]))], clip, world.physics.fps)
-        for k, record in enumerate(drawn.spec.lanes):
-            seen = observe(clip, lane_question(record.lane.strip, drawn.spec.question))
-            reads.append(Read(record.ground_truth, tracked(world, k, record.lane.timetable), seen, is_filmed=True))
-    return reads
+        return [observe(clip, lane_question(record.lane.strip, spec.question)) for record in spec.lanes]
 
 
 def tracked(world: TwoLanes, lane: int, timetable: Timetable) -> tuple[str | None, ...]:

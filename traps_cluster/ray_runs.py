@@ -33,7 +33,7 @@ from traps_pipeline.models.registry.entries import LOCAL, get_model
 from traps_pipeline.pipeline.graph import Stage, the_graph
 from traps_pipeline.pipeline.metadata import tally_of
 from traps_pipeline.pipeline.ranges import Range
-from traps_pipeline.pipeline.runs import RunOutcome, Runs, is_broken_off, keys_of, problems_of, range_tags, reason
+from traps_pipeline.pipeline.runs import RunOutcome, Runs, failed_outcome, is_broken_off, keys_of, range_tags, reason
 from traps_pipeline.pipeline.step import TAKEN, UNWANTED
 from traps_pipeline.protocol.cells import Cell
 from traps_pipeline.storage.workspace import RAY, VARIABLE, Workspace
@@ -243,7 +243,7 @@ class RayRuns(Runs):
         name = f"run {run_id[:8]} of the study {self._workspace.study.name}"
         if run is None:
             return RunOutcome([f"{name} is in Dagster's history no more"], over_budget=False)
-        outcome = problems_of([] if run.status == dg.DagsterRunStatus.SUCCESS else failures)
+        outcome = failed_outcome([] if run.status == dg.DagsterRunStatus.SUCCESS else failures)
         if run.status != dg.DagsterRunStatus.SUCCESS and not outcome.problems:
             message = " ".join(self._last_message(run_id).split())
             # The beginning names what failed, and at its end a log has the cause.

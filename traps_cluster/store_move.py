@@ -12,7 +12,7 @@ from traps_pipeline.base import progress
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.ledger.row_transfer import copy_ledger
-from traps_pipeline.storage.parquet import note_of
+from traps_pipeline.storage.parquet import partition_note
 from traps_pipeline.storage.place import STUDY, Place, scratch_of
 from traps_pipeline.storage.workspace import DATABASE, Workspace
 
@@ -65,7 +65,7 @@ def _move_files(workspace: Workspace, target: Workspace) -> None:
             destination = target.root / path.relative_to(workspace.root)
             if path.is_relative_to(workspace.tables.root):
                 try:
-                    target.store.write({destination: path.read_bytes()}, note=note_of(path))
+                    target.store.write({destination: path.read_bytes()}, note=partition_note(path))
                 except TrapsError as error:
                     progress.current().note(f"{error}; it is left, and made anew")
                 continue

@@ -111,7 +111,7 @@ def test_a_key_that_nobody_named_is_known_by_its_place(text: str, shown: str) ->
 def test_the_password_of_an_address_and_a_key_with_any_name_are_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LAB_DATABASE", "postgresql://lab:s3cret%2Fpassword@db/traps")
     monkeypatch.setenv("LAB", "token-of-the-lab")
-    redaction.hide("LAB")
+    redaction.redact_environment_variable("LAB")
     assert redact("password s3cret/password of token-of-the-lab") == "password *** of ***"
 
 
@@ -164,5 +164,5 @@ def test_a_key_is_hidden_from_the_moment_that_it_is_set_changed_or_named(monkeyp
     assert redact(f"{first} {second}") == f"{first} ***"
     monkeypatch.setenv("SOME_VALUE", named)
     assert redact(named) == named
-    redaction.hide("SOME_VALUE")
+    redaction.redact_environment_variable("SOME_VALUE")
     assert redact(named) == "***"

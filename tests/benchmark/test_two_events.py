@@ -10,7 +10,15 @@ from typing import Any
 import pytest
 
 from traps_pipeline.base.errors import TrapsError
-from traps_pipeline.benchmark.corrections import LaneScenario, apply_to_lanes, of_pairs, of_study, read_corrections
+from traps_pipeline.benchmark.corrections import (
+    Correction,
+    LaneScenario,
+    apply_to_lanes,
+    of_pairs,
+    of_study,
+    read_corrections,
+)
+from traps_pipeline.benchmark.decisions import save_decision, undo_decision
 from traps_pipeline.benchmark.filmed_arms import incomplete_reasons
 from traps_pipeline.benchmark.records import load_released, two_events_lines
 from traps_pipeline.protocol.two_events import LaneItem, lane_item, lane_items
@@ -69,6 +77,17 @@ def test_a_scenario_of_two_events_is_discarded_restored_and_reworded_in_both_lan
     asked = [each.text for each in reworded.questions()]
     assert len({*asked}) == 2 and all(text.endswith("does it stop, yes or no?") for text in asked)
     assert reworded.scene_hash == two_events_lines()[ID].spec.scene_hash  # so no clip is drawn again
+
+
+def test_the_last_decision_about_two_events_is_taken_back(tmp_path: Path):
+    for seen, changes in enumerate(
+        ({"action": "correct", "question": "Does it stop, yes or no?"}, {"action": "discard"})
+    ):
+        signed = {"scenario_id": ID, "who": "jd", "when": "2026-11-21", "why": "reviewed"}
+        save_decision(Correction.model_validate(signed | changes), seen, tmp_path)
+    undo_decision(ID, 2, who="jd", why="no", folder=tmp_path)
+    scenario = apply_to_lanes(two_events_lines(), read_corrections(tmp_path))[ID]
+    assert scenario.spec.question == "Does it stop, yes or no?"
 
 
 @pytest.mark.parametrize(

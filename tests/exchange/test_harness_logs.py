@@ -14,7 +14,7 @@ from tests.build.errors import raises
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.exchange import harness_logs
 from traps_pipeline.exchange.answer_exchange import Answer, AnswerContext, _answers_by_item, checked_answers
-from traps_pipeline.exchange.harness_logs import reader_of
+from traps_pipeline.exchange.harness_logs import log_reader
 from traps_pipeline.models.request import Request
 
 
@@ -36,7 +36,7 @@ def wanted(*runs: int) -> Mapping[str, Request]:
 def imported(folder: Path, *samples: Mapping[str, Any], run: int = 1) -> tuple[dict[str, Answer], int]:
     log = folder / "log.json"
     log.write_text(json.dumps({"samples": samples}))
-    reader = reader_of(log)
+    reader = log_reader(log)
     assert reader is not None
     return _answers_by_item(reader(log), wanted(1, 2, 3), AnswerContext("m", run))
 
@@ -92,7 +92,7 @@ def test_scores_that_are_no_numbers_and_twice_written_samples_hinder_no_import(t
         archive.writestr("samples/x_epoch_1.json", json.dumps(scored))
         with pytest.warns(UserWarning, match="Duplicate name"):
             archive.writestr("samples/x_epoch_1.json", json.dumps(scored))
-    reader = reader_of(log)
+    reader = log_reader(log)
     assert reader is not None and _answers_by_item(reader(log), wanted(1), AnswerContext("m"))[0]["x1"].text == "left"
 
 
@@ -101,7 +101,7 @@ def test_a_byte_order_mark_before_the_first_line_is_no_part_of_it(tmp_path: Path
     path.write_text('{"key": "x1", "text": "left"}\n', encoding="utf-8-sig")
     assert checked_answers(path, wanted(1))["x1"].text == "left"
     path.write_text('{"item": "x", "regime": "json", "text": "left"}\n', encoding="utf-8-sig")
-    reader = reader_of(path)
+    reader = log_reader(path)
     assert reader is not None and _answers_by_item(reader(path), wanted(1), AnswerContext("m"))[0]["x1"].text == "left"
 
 
@@ -113,7 +113,7 @@ def test_samples_that_together_are_larger_than_a_log_may_be_are_refused_unread(
     with zipfile.ZipFile(log, "w") as archive:
         for number in range(3):
             archive.writestr(f"samples/{number}_epoch_1.json", text)
-    reader = reader_of(log)
+    reader = log_reader(log)
     assert reader is not None
     monkeypatch.setattr(harness_logs, "MAX_LOG_BYTES", 3 * len(text))
     assert len([*reader(log)]) == 3

@@ -15,6 +15,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from fastapi.testclient import TestClient
 from playwright.sync_api import Browser
 
 from tests.conftest import Checkout
@@ -33,6 +34,8 @@ from traps_pipeline.release.verification import released_items, verify
 from traps_pipeline.report.explorer.site import write_site
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scoring.score_rows import GRADED_CUTS, HYPOTHESES, LEADERBOARD, TWO_WAY
+from traps_pipeline.servers.review import Decision, Preview, Review, review_app
+from traps_pipeline.servers.server import Refused
 from traps_pipeline.storage.benchmark_tables import ARMS, ITEMS
 from traps_pipeline.storage.parquet import TableStore
 from traps_pipeline.storage.tables import records
@@ -149,6 +152,17 @@ def test_four_clips_play_in_step_above_the_times_of_their_boards(
     assert page.get_by_role("link", name="4 of 8").count() == 2  # any-rule and occluder-rule abstain on all
     page.context.close()
     assert problems == []
+
+
+def test_two_events_are_reviewed_with_their_four_clips(armed: tuple[Checkout, Path, dict[str, int]]) -> None:
+    review, id_ = Review(Workspace.open(armed[0].workspace), "jd"), "hidden_drop-e001"
+    assert id_ in review.queue("all") and {side for scenario, side in review.clips if scenario == id_} == {*CLIPS}
+    shown = TestClient(review_app(review)).get(f"/scenario/{id_}").text
+    assert all(f"Hidden, {clip}: " in shown for clip in CLIPS)
+    cost = review.preview(Preview(scenario_id=id_, changes={"question": "Left or right?"}))["cost"]
+    assert cost.startswith("8 items ") and "24 answers" in cost  # of three models, under one regime
+    with pytest.raises(Refused, match="drawn"):
+        review.decide(Decision(scenario_id=id_, action="add", changes={}, why="more", seen=0))
 
 
 def test_two_events_are_released_submitted_and_scored_by_others(

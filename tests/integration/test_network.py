@@ -268,7 +268,7 @@ def test_a_cluster_answers_in_the_models_stead(unasked: Checkout, provider: Prov
     for some, counts in ((answers[:20], {"new": 20, "known": 0}), (answers, {"new": 4, "known": 20})):
         given.write_text("\n".join(json.dumps(answer) for answer in some))
         imported = json.loads(unasked.traps("study", "import-answers", path, given, "--json").ok().out)
-        assert imported == counts | {"failed": "", "dropped": 0}
+        assert imported == counts | {"failed": "", "dropped": 0, "scores": 2}
     finished = ask(unasked, path).ok()
     assert finished.counts()["answers"] == 0
     assert provider.stats()["requests"] == 0

@@ -14,7 +14,14 @@ from tests.providers.server import Provider
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.cli import main
 from traps_pipeline.judging.judging_rows import JUDGE_ROBUSTNESS
-from traps_pipeline.judging.robustness import ATTACKS_FILE, TASKS, check_panel, load_attacks, result, robustness_summary
+from traps_pipeline.judging.robustness import (
+    ATTACKS_FILE,
+    TASKS,
+    attack_effect,
+    check_panel,
+    load_attacks,
+    robustness_summary,
+)
 from traps_pipeline.models.registry.judges import JudgeEntry, load_panel
 from traps_pipeline.protocol.ratings import PANEL
 from traps_pipeline.storage.study import Study
@@ -95,7 +102,7 @@ def test_a_judge_that_obeys_is_found_and_one_that_is_confused_and_the_panel_hold
     ],
 )
 def test_an_attack_moved_a_vote_only_if_it_was_right_without_it(expected, clean, vote, what) -> None:
-    assert result(expected, clean, vote) == what
+    assert attack_effect(expected, clean, vote) == what
 
 
 @pytest.mark.parametrize(

@@ -249,6 +249,17 @@ def test_money_of_rows_that_vanished_counts_until_it_is_released(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    "note",
+    ["", "{}", "[" * 100_000, "[1e999, {}]", '[1, {"m": 1e999}]', f'[1, {{"m": {10**400}}}]', '[1, {"\\ud800": 1}]'],
+)
+def test_a_damaged_note_of_money_is_not_believed(tmp_path: Path, note: str) -> None:
+    write(local(tmp_path), paid("a", 0.5))
+    (tmp_path / "ledger.booked.json").write_text(note)
+    with (ledger := local(tmp_path)).database.writing():
+        assert Money(ledger.database).spent() == {"m": 0.5}
+
+
 @pytest.mark.slow
 def test_money_of_a_killed_run_counts_where_its_log_is_lost(tmp_path: Path) -> None:
     place = Place(("sqlite", str(tmp_path)))
@@ -299,12 +310,16 @@ def test_an_account_is_used_until_its_last_use_in_a_process_ends(place: Place) -
             assert count("a") == 2
 
 
-def test_what_is_whole_of_a_cut_ledger_is_saved_and_the_rest_is_told(tmp_path: Path) -> None:
-    rows = [paid(f"k{number}", 0.25) | {"text": "x" * 2000} for number in range(200)]
+@pytest.mark.parametrize("size", [2000, 400])
+@pytest.mark.parametrize("into_a_page", [0, 1000, 3000])
+def test_what_is_whole_of_a_cut_ledger_is_saved_and_the_rest_is_told(
+    tmp_path: Path, size: int, into_a_page: int
+) -> None:
+    rows = [paid(f"k{number}", 0.25) | {"text": "x" * size} for number in range(200)]
     write(local(tmp_path), *rows)
     file, told = tmp_path / "ledger.sqlite", list[str]()
     content = file.read_bytes()
-    file.write_bytes(content[: len(content) * 2 // 3])
+    file.write_bytes(content[: len(content) // 4096 * 3 // 4 * 4096 + into_a_page])
     count = export_ledger(local(tmp_path).database, tmp_path / "saved" / "whole.sqlite", told.append)
     saved = Ledger(SqliteDatabase(tmp_path / "saved", file="whole.sqlite"), "answers")
     assert 100 < count < 200 and len(saved.read("m").settled) == count

@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from traps_pipeline.ledger.rows import MAX_TOKENS, MAX_USD, is_cost, is_count, is_seconds, replace_impossible
+from traps_pipeline.ledger.rows import MAX_TOKENS, MAX_USD, is_amount, is_cost, is_count, replace_impossible
 
 
 @pytest.mark.parametrize(
     ("fits", "values", "others"),
     [
         (is_count, [0, 1, MAX_TOKENS], [-1, MAX_TOKENS + 1, 1.0, True, "1", None, math.nan]),
-        (is_cost, [0, 0.0, 0.25, MAX_USD], [-1e-9, MAX_USD + 1, math.inf, math.nan, True, "0.25", None]),
-        (is_seconds, [0, 0.5], [-0.5, math.inf, "1"]),
+        (is_cost, [0, 0.0, 0.25, MAX_USD], [-1e-9, MAX_USD + 1, 10**400, math.inf, math.nan, True, "0.25", None]),
+        (is_amount, [0, 0.5], [-0.5, 10**400, math.inf, math.nan, "1"]),
     ],
 )
 def test_counts_costs_and_times_are_what_a_call_can_take(

@@ -17,7 +17,7 @@ import pytest
 from tests.conftest import ROOT
 from tests.mechanism.study import register
 from traps_pipeline.mechanism import patching_stage
-from traps_pipeline.mechanism.patching_effects import RecordedPass, run_pass
+from traps_pipeline.mechanism.patching_effects import RecordedPass, trace_pass
 from traps_pipeline.models.registry.entries import ModelEntry
 from traps_pipeline.protocol.cells import Extraction, SteeringCell
 from traps_pipeline.storage.workspace import Workspace
@@ -41,11 +41,11 @@ def patch_pairs(workspace: Workspace, entry: ModelEntry, patch: pytest.MonkeyPat
     margins = list[float]()
 
     def counting(*args: Any) -> RecordedPass:
-        made = run_pass(*args)
+        made = trace_pass(*args)
         margins.append(made.margin)
         return made
 
-    patch.setattr(patching_stage, "run_pass", counting)
+    patch.setattr(patching_stage, "trace_pass", counting)
     rows = patching_stage.patching_rows(workspace, entry, STANDARD)
     return {"made": len(margins), "content": [asdict(row) for row in rows]}
 

@@ -21,7 +21,7 @@ from tests import local_models
 from tests.local_models import FAMILIES, QUESTIONS, SYSTEM, Family
 from tools.tiny_checkpoints import build_tiny
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, run_pass
+from traps_pipeline.mechanism.patching_effects import SITES, Patch, Site, patched_changes, trace_pass
 from traps_pipeline.mechanism.steered_backend import SteeredBackend
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.local.library import load_transformers
@@ -298,7 +298,7 @@ def test_effects_of_patches_are_those_of_plain_hooks_at_every_site_and_group(nam
     turned = QUESTIONS[1].replace("left, right", "right, left")
     source = of.prompt(there.frames, there.times_s + 7, turned)
     tokens, groups = abstention_tokens(of.of), groups_of(of, target)
-    recorded = [run_pass(of.of, prompt, tokens) for prompt in (target, source)]
+    recorded = [trace_pass(of.of, prompt, tokens) for prompt in (target, source)]
     own = [plain_margin(of, plain_pass(of, prompt, ExitStack()), tokens) for prompt in (target, source)]
     assert [one.margin for one in recorded] == pytest.approx(own, abs=1e-5)
     gap = own[1] - own[0]

@@ -28,7 +28,7 @@ from traps_pipeline.mechanism.patching_effects import (
     attributed_changes,
     patched_changes,
     require_patchable,
-    run_pass,
+    trace_pass,
 )
 from traps_pipeline.models.local.adapter import LocalModel, Prompt, load_local_model
 from traps_pipeline.models.registry.entries import get_model
@@ -67,7 +67,7 @@ def pair(
     else:
         target = ask(of)
     source, tokens = other(target), abstention_tokens(of)
-    return of, run_pass(of, target, tokens), run_pass(of, source, tokens), tokens, target, source
+    return of, trace_pass(of, target, tokens), trace_pass(of, source, tokens), tokens, target, source
 
 
 def test_what_experts_make_beside_an_mlp_is_of_its_site(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_what_experts_make_beside_an_mlp_is_of_its_site(tmp_path: Path) -> None:
     of.forward(donor)
     handle.remove()
     handle = block.post_feedforward_layernorm.register_forward_hook(lambda *_: kept[0])
-    margin = run_pass(of, prompt, tokens).margin
+    margin = trace_pass(of, prompt, tokens).margin
     handle.remove()
     change = patched_changes(of, target, source, [Patch("mlp", 2, whole)], tokens)[0]
     assert abs(change) > 1e-3 and target.margin + change == pytest.approx(margin, abs=1e-5)
@@ -118,7 +118,7 @@ def test_margins_are_read_off_a_head_whose_weights_are_offloaded() -> None:
     assert head.weight.is_meta
     own_head, of.network.lm_head = of.network.lm_head, head  # what monkeypatch would not give back to a module
     try:
-        assert run_pass(of, prompt, tokens).margin == target.margin
+        assert trace_pass(of, prompt, tokens).margin == target.margin
     finally:
         of.network.lm_head = own_head
 
@@ -176,7 +176,7 @@ def test_models_whose_blocks_read_more_than_is_known_are_refused(field: str, mon
 
 def test_prompts_of_another_form_are_refused() -> None:
     of, target, _, tokens, *_ = pair("qwen3-vl")
-    longer = run_pass(of, ask(of, QUESTIONS[1]), tokens)
+    longer = trace_pass(of, ask(of, QUESTIONS[1]), tokens)
     elsewhere = replace(target, pictures=np.roll(target.pictures, 1))
     for source in (longer, elsewhere):
         with raises(TrapsError, "mechanism.patching_effects._require_one_form", str(source.length), str(target.length)):

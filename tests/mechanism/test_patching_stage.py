@@ -18,7 +18,7 @@ from traps_pipeline.base.digests import file_digest
 from traps_pipeline.mechanism import patching_stage
 from traps_pipeline.mechanism.directions import seeded_order
 from traps_pipeline.mechanism.mechanism_rows import PROBE_ITEMS
-from traps_pipeline.mechanism.patching_effects import Patch, RecordedPass, run_pass
+from traps_pipeline.mechanism.patching_effects import Patch, RecordedPass, trace_pass
 from traps_pipeline.mechanism.patching_stage import (
     Side,
     best_cells,
@@ -243,7 +243,7 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
     pairs: list[tuple[tuple[str, str, str], tuple[str, str, str]]] = []
 
     def recording(of: LocalModel, prompt: Prompt, *rest: Any) -> RecordedPass:
-        recorded = run_pass(of, prompt, *rest)
+        recorded = trace_pass(of, prompt, *rest)
         kept.append(recorded)  # or another one might get its address
         prompts[id(recorded)] = names[content(prompt)]
         return recorded
@@ -254,7 +254,7 @@ def test_a_null_is_the_next_scenario_that_fits_or_the_own_frames_with_the_other_
         pairs.append((prompts[id(target)], prompts[id(source)]))
         return np.full(len(patches), float(pairs[-1][0][1] != pairs[-1][1][1]))  # 1 for frames of the other side
 
-    monkeypatch.setattr(patching_stage, "run_pass", recording)
+    monkeypatch.setattr(patching_stage, "trace_pass", recording)
     monkeypatch.setattr(patching_stage, "patched_changes", changes)
     made = patching_rows(workspace, entry, TINY)
     order = seeded_order(sorted({name for name, _ in rows}), workspace.mechanism.seed)

@@ -23,9 +23,9 @@ from traps_pipeline.mechanism.probes import (
     fit_probe,
     nearest_centroid,
     scenario_folds,
+    side_swapped_labels,
     solve_gram,
     standardiser,
-    swapped_labels,
     within_split,
 )
 from traps_pipeline.mechanism.probing import Confabulated, NothingConfabulated, ProbeRun, confabulated_scenarios
@@ -126,7 +126,7 @@ def test_shuffled_labels_give_half_on_average_even_where_the_signal_is_perfect()
     states = np.repeat(rng.normal(size=(40, 30)), 2, axis=0) + rng.normal(size=(80, 30))
     states[void, 0] += 6
     split, folds = Split(states, void, scenario), scenario_folds(scenario, 5, 0)
-    swapped = swapped_labels(void, scenario, 40, seed=2)
+    swapped = side_swapped_labels(void, scenario, 40, seed=2)
     assert (swapped.sum(axis=0) == 40).all()  # one void a scenario, whichever it is
     areas = within_split(split, np.column_stack([void, swapped]), folds)
     assert areas[0] > 0.99

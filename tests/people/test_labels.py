@@ -14,7 +14,7 @@ from traps_pipeline.base.digests import digest
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.judging.agreement import krippendorff_alpha
 from traps_pipeline.people.human_label_rows import HUMAN_LABELS, LABELS_FILE, labels_version
-from traps_pipeline.people.label_units import annotation_protocol, drawn_units, queue_of
+from traps_pipeline.people.label_units import annotation_protocol, drawn_units, personal_order
 from traps_pipeline.people.labels import confabulation_rows, human_agreement, label_lines, label_matrix, true_labels
 from traps_pipeline.storage.lines import line_with_checksum
 
@@ -42,9 +42,9 @@ def test_a_sample_is_the_first_units_of_each_stratum_in_a_seeded_order(n_split: 
 
 def test_each_person_has_an_order_of_their_own_over_the_same_units() -> None:
     sampled = group(30, 0)
-    jd, ab = queue_of("jd", sampled), queue_of("ab", sampled)
+    jd, ab = personal_order("jd", sampled), personal_order("ab", sampled)
     assert sorted(jd) == sorted(ab) == sorted(sampled["unit"])
-    assert jd != ab and jd == queue_of("jd", sampled.iloc[::-1])
+    assert jd != ab and jd == personal_order("jd", sampled.iloc[::-1])
 
 
 # --- labels -----------------------------------------------------------------------------------------------------------

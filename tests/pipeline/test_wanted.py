@@ -11,7 +11,7 @@ from tests.build.cells import row
 from traps_pipeline.judging.judging_rows import VERDICTS
 from traps_pipeline.pipeline.graph import the_graph
 from traps_pipeline.pipeline.wanted import StudyPartitions
-from traps_pipeline.report.printed_board import NO_BOARD, printed_board
+from traps_pipeline.report.printed_board import NO_BOARD, stored_leaderboard_text
 from traps_pipeline.storage.study import Asked, Study
 from traps_pipeline.storage.workspace import Workspace
 
@@ -34,7 +34,7 @@ def test_a_study_without_pairs_wants_no_table_of_pairs(
 
 
 def test_a_run_without_pairs_ends_with_a_sentence_in_place_of_the_leaderboard(tmp_path: Path) -> None:
-    assert printed_board(Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))) == NO_BOARD
+    assert stored_leaderboard_text(Workspace.create(tmp_path / "study", Study(scenarios=["plinko-0001"]))) == NO_BOARD
 
 
 def test_rows_that_the_study_no_longer_asks_for_are_named_below_the_leaderboard(tmp_path: Path) -> None:
@@ -43,5 +43,5 @@ def test_rows_that_the_study_no_longer_asks_for_are_named_below_the_leaderboard(
     for model, regime in (("oracle", "standard"), ("oracle", "json"), ("prior", "standard"), ("prior", "json")):
         cell = {"dataset": "chaotic", "model": model, "regime": regime, "run": 1}
         workspace.tables.write(VERDICTS, cell, [row(VERDICTS, item_id="a", **cell)], {})
-    told = printed_board(workspace).splitlines()[-1]
+    told = stored_leaderboard_text(workspace).splitlines()[-1]
     assert re.findall(r"\b(?:oracle|prior)\b(?: \(\w+\))?", told) == ["oracle (json)", "prior"]

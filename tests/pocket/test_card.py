@@ -89,4 +89,4 @@ def test_the_card_over_seeds_is_made_from_their_finished_workspaces(tmp_path: Pa
         Figure(1, "1" * 12, "differ", "model", 1.0), Figure(2, "2" * 12, "differ", "model", 0.75),
     ]  # fmt: skip
     *_, row = markdown(found, found[:1]).splitlines()
-    assert row.endswith(" ≥ 0.5 | 1.00, 0.75 | – | – | – | 1.00 | holds in pocket, no gap too |")
+    assert row.endswith(" ≥ 0.5 | 1.00, 0.75 | 1.00 | holds in pocket, no gap too |")

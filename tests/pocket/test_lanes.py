@@ -85,7 +85,7 @@ def test_the_asked_lane_alone_decides_what_is_said(recipe: Recipe, data: Path) -
         record, hidden = scenes.records[look.scene], [*CLIPS.values()][look.side]
         for lane, name in enumerate(LANES):
             (asked,) = (each for each in look.questions if each.question == record.questions[lane])
-            assert f"the {record.strips[lane]} strip, leaving its bench aside: " in asked.question
+            assert f"the {record.strips[lane]} strip, not on its grey bench: " in asked.question
             label = scenes.label(look, asked, "vqa_guided")
             assert label == (None if hidden[lane] else record.answers[lane])
             seen.add((name, hidden[lane]))

@@ -68,18 +68,21 @@ def test_a_commitment_tells_neither_the_seed_nor_a_record(committed: Path) -> No
 def test_an_edited_record_is_named(copy: Path, committed: Path) -> None:
     assert problems(committed) == []
     edit(copy / "private" / "released" / "hidden_drop.jsonl", ill_posed_question="What does it weigh?")
-    assert named(problems(copy)) == ["hidden_drop-0001"]
+    edit(copy / "private" / "two_events" / "released" / "hidden_drop.jsonl", question="Left or right?")
+    assert named(problems(copy)) == ["hidden_drop-0001", "hidden_drop-e001"]
 
 
 def test_records_that_were_left_out_or_added_are_named(copy: Path) -> None:
-    (spec,) = revealed_specs(copy / "private").values()
+    spec, lanes = revealed_specs(copy / "private").values()
     other = spec.model_copy(update={"scenario_id": "hidden_drop-0002"})
     files = read_commitment(copy / "commitment.json"), read_reveal(copy / "reveal.json")
-    assert named(broken_seals(*files, {other.scenario_id: other})) == ["hidden_drop-0001", "hidden_drop-0002"]
+    left = {each.scenario_id: each for each in (other, lanes)}
+    assert named(broken_seals(*files, left)) == ["hidden_drop-0001", "hidden_drop-0002"]
+    assert named(broken_seals(*files, {spec.scenario_id: spec})) == ["hidden_drop-e001"]
 
 
 # Records are sealed with the number, too.
-@pytest.mark.parametrize(("change", "n_broken"), [({"seed": 2027}, 1), ({"nonce": "0" * 64}, 2)])
+@pytest.mark.parametrize(("change", "n_broken"), [({"seed": 2027}, 1), ({"nonce": "0" * 64}, 3)])
 def test_another_seed_or_number_is_refused_before_anything_is_drawn(
     copy: Path, tmp_path: Path, change: dict[str, Any], n_broken: int
 ) -> None:

@@ -183,18 +183,18 @@ def test_mlcroissant_validates_its_description_and_reads_every_record(released: 
 SIGN = """
 import sys
 from pathlib import Path
-from traps_pipeline.release.signing import check_signature, sign
+from traps_pipeline.release.signing import sign, signature_problem
 folder, private, public, other = map(Path, sys.argv[1:])
-for refused in (lambda: sign(folder, public), lambda: check_signature(folder, public)):
+for refused in (lambda: sign(folder, public), lambda: signature_problem(folder, public)):
     try:
         refused()
     except TrapsError as error:
         print(error)
 sign(folder, private)
-print(repr(check_signature(folder, public)))
-print(check_signature(folder, other))
+print(repr(signature_problem(folder, public)))
+print(signature_problem(folder, other))
 (folder / "prompts.jsonl").write_text("other")
-print(check_signature(folder, public))
+print(signature_problem(folder, public))
 """
 
 

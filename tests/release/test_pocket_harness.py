@@ -14,7 +14,7 @@ from tests.build.harness import ours
 from tests.conftest import ROOT, Checkout
 from tests.release.environments import python_of, run_in
 from tests.serving import transformers_serve
-from traps_pipeline.exchange.harness_logs import reader_of
+from traps_pipeline.exchange.harness_logs import log_reader
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.release.harness.scoring import RUN_METRICS
 from traps_pipeline.release.harness.write import media_settings, write_harness
@@ -56,7 +56,7 @@ class Served:
 
 def logged(path: Path) -> dict[str, tuple[str, str]]:
     """Outcomes and texts by item as `traps study import-answers` reads them from a harness's log."""
-    read = reader_of(path)
+    read = log_reader(path)
     assert read is not None
     return {one.item: (one.answer["outcome"], one.answer["text"]) for one in read(path)}
 

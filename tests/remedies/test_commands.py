@@ -13,7 +13,7 @@ from tests.conftest import SMALL, Checkout
 from tests.remedies.remedied import remedied
 from traps_pipeline.exchange import harness_logs
 from traps_pipeline.exchange.answer_exchange import export_requests
-from traps_pipeline.exchange.harness_logs import reader_of
+from traps_pipeline.exchange.harness_logs import log_reader
 from traps_pipeline.exchange.provider_batch import FOLDER, export_batches
 from traps_pipeline.pipeline.experiment import load_experiment
 from traps_pipeline.storage.workspace import Workspace
@@ -52,7 +52,7 @@ def test_a_log_without_images_is_read(ending: str, tmp_path: Path, monkeypatch: 
             archive.writestr("samples/x.json", json.dumps(sample))
 
     write(2000)
-    reader = reader_of(log)
+    reader = log_reader(log)
     assert reader is not None
     (answer,) = remedied(lambda: list(reader(log)), "exchange.harness_logs", lambda: write(10))
     assert answer.item == "x"

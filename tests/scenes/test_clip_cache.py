@@ -13,7 +13,7 @@ from tests.conftest import ROOT, Checkout
 from tests.remedies.remedied import remedied
 from traps_pipeline.scenes.worlds import clip_cache
 from traps_pipeline.scenes.worlds.clip_cache import VARIABLE, ClipCache
-from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import clip_note_path, read_clip, save_clip
 
 SCENE = "a" * 64
 ONE_SCENARIO = "name: one\npanel: rules\nmodels: [oracle]\nscenarios: [hidden_race-0001]\n"
@@ -55,7 +55,7 @@ def test_an_entry_with_a_flipped_byte_is_removed_and_not_given(
 ) -> None:
     cache.keep([clip], SCENE)
     (entry,) = entries(cache)
-    path = entry if damaged == "clip" else note_of(entry)
+    path = entry if damaged == "clip" else clip_note_path(entry)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)

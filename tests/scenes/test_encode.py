@@ -22,7 +22,7 @@ from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.physics.kit import Physics
 from traps_pipeline.scenes.picture.camera import Camera
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.worlds.clip_notes import check_clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import check_clip, clip_note_path, read_clip, save_clip
 from traps_pipeline.scenes.worlds.outcome import compile_scene
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.video.encode import DamagedClip, decode, encode, frames_digest
@@ -77,7 +77,7 @@ def test_a_clip_is_checked_by_size_and_digest(clip: Path) -> None:
 def test_a_flipped_bit_in_a_clips_note_is_never_believed(tmp_path: Path) -> None:
     clip = tmp_path / "void.mp4"
     save_clip(clip, frames(3), 10, leaked_pixels=0.25)
-    known, note = read_clip(clip), note_of(clip)
+    known, note = read_clip(clip), clip_note_path(clip)
     assert known is not None and (known.n_frames, known.fps, known.leaked_pixels) == (3, 10, 0.25)
     written = note.read_bytes()
     for place in range(8 * len(written)):

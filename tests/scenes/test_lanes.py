@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import auc, balance, lane_numbers, telling_numbers
 from traps_pipeline.benchmark.records import two_events_lines
 from traps_pipeline.protocol.datasets import OCCLUSION_CATEGORIES
-from traps_pipeline.protocol.two_events import CLIPS
-from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record, certify_lanes
+from traps_pipeline.protocol.two_events import CLIPS, LANES
+from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record, certify_lanes, pixels_of
 from traps_pipeline.scenes.draw.draw_lanes import (
     LEFT_OUT,
     DrawnLanes,
@@ -25,6 +26,7 @@ from traps_pipeline.scenes.draw.draw_lanes import (
 )
 from traps_pipeline.scenes.family_registry import families
 from traps_pipeline.scenes.parts.difficulty import Difficulty
+from traps_pipeline.scenes.physics.kit import flag_of
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.lane_layout import fit_lanes
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
@@ -79,6 +81,37 @@ def test_drawn_timetables_leave_a_second_that_shows_what_has_settled_and_begin_a
         assert (away == 0).any()
         ends[bool(away[0] == 0), bool(away[-1] == 0)] += 1
     assert len(ends) == 4 and min(ends.values()) > 10
+
+
+def test_a_window_alone_shows_what_has_settled_and_is_short_only_where_a_draw_says_so():
+    timetable = Timetable.of_window(30, 2, 50)
+    assert np.flatnonzero(timetable.away(50) == 1).tolist() == [30, 31]
+    assert timetable.shows(20, 50, 10, window_s=0.2) and not timetable.shows(31, 50, 10, window_s=0.2)
+    assert not timetable.shows(20, 50, 10)
+
+
+# --- doubles and flags ------------------------------------------------------------------------------------------------
+
+
+def test_no_double_passes_through_another():
+    for scenario_id in ("head_on-e001", "head_on-e007", "hidden_collision-e002", "domino_count-e001"):
+        spec = two_events_lines()[scenario_id].spec
+        for record, event in zip(spec.lanes, spec.world().events, strict=True):
+            widths = [float(np.ptp(span[:, 0])) for span in event.doubles(record.lane.size).values()]
+            paths = [np.array(path)[:, 0] for path in record.layout.paths]
+            for (one, wide), (other, as_wide) in combinations(zip(paths, widths, strict=True), 2):
+                assert (np.abs(one - other) > (wide + as_wide) / 2 - 0.001).all(), scenario_id
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario_id", ["domino_chain-e007", "ramp_deflect-e007"])  # whose boards reach over the masts
+def test_no_board_before_a_scene_hides_a_flag(scenario_id: str):
+    spec = two_events_lines()[scenario_id].spec
+    world = spec.world(trajectories_of(spec)["qpos"])
+    for lane, event in zip(LANES, world.events, strict=True):
+        flags = [f"{lane} {flag_of(mark)}" for mark in event.scene.marks]
+        seen, hidden = (pixels_of(world, clip, flags, [0, 20]) for clip in ("neither", "both"))
+        assert flags and hidden.max(axis=0).tolist() == seen.max(axis=0).tolist()
 
 
 # --- worlds -----------------------------------------------------------------------------------------------------------
@@ -164,6 +197,19 @@ def test_a_level_is_drawn_in_both_lanes_and_in_their_twins_and_read_back_from_th
     for each in (world, *twins):
         assert names <= {each.model.body(i).name for i in range(each.model.nbody)}
         assert each.physics.speed == 1.5
+
+
+@pytest.mark.slow
+def test_the_hard_level_of_a_scenario_is_the_same_scene_that_shows_its_outcomes_for_a_shorter_time():
+    *_, last = draw_two_events("slide", 1, 7, Difficulty(window_s=0.2))
+    assert isinstance(last, DrawnLanes) and last.spec.evidence["least_px"]
+    assert difficulty_of(last.spec.model_dump(mode="json")) == Difficulty(window_s=0.2)
+    assert last.spec.trajectory_sha256 == drawn("slide").trajectory_sha256
+    lanes = zip(last.spec.lanes, drawn("slide").lanes, last.spec.evidence["settled_frames"], strict=True)
+    for hard, usual, settled in lanes:
+        assert hard.layout == usual.layout and hard.params == usual.params
+        opened = np.flatnonzero(hard.lane.timetable.away(50) == 1)
+        assert len(opened) == 2 and opened[0] >= settled
 
 
 # --- items ------------------------------------------------------------------------------------------------------------

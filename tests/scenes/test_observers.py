@@ -9,8 +9,9 @@ import pytest
 from tests.scenes.observed import frozen, observed
 from tests.scenes.released import SAMPLED, SIX, Released, first_of_each, load
 from traps_pipeline.benchmark.records import load_released
+from traps_pipeline.scenes.family_registry import get_family
 from traps_pipeline.scenes.observe import family_asking
-from traps_pipeline.scenes.parts.vision import blobs, colour_mask
+from traps_pipeline.scenes.parts.vision import after_occluder, blobs, colour_mask
 from traps_pipeline.scenes.parts.wording import match_slots
 from traps_pipeline.scenes.physics.kit import COLOURS
 from traps_pipeline.scenes.physics.simulate import swept_points
@@ -59,7 +60,7 @@ def _reads(arm: str, scenario_id: str) -> tuple[str | None, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario_id", ["bounce-0001", "slide-0001"])
+@pytest.mark.parametrize("scenario_id", ["catch-0001", "tower-0001", "bounce-0001", "slide-0001"])
 def test_the_observer_answers_after_a_late_occluder_from_what_was_seen_before(scenario_id: str) -> None:
     said, answer = _reads("late_occluder", scenario_id)
     assert said == answer
@@ -85,6 +86,17 @@ def _with_occluder_elsewhere(case: Released, frames: np.ndarray) -> np.ndarray:
                 changed[:, top : top + PATCH, left : left + PATCH] = np.array(COLOURS["navy"]) * 255
                 return changed
     return frames
+
+
+def test_an_observer_abstains_where_an_occluder_goes_for_a_last_frame_alone() -> None:
+    frames = np.full((6, HEIGHT, WIDTH, 3), 200, np.uint8)
+    frames[:5, 100:240, 120:360] = np.array(COLOURS["navy"]) * 255
+    assert len(after_occluder(frames)) == 1
+    asked = {spec.family: spec.question for spec in load_released().values()}
+    answers = {name: get_family(name).observe for name in asked}
+    for shown in (frames, frames[-1:]):
+        said = {name: observe(shown, asked[name]) for name, observe in answers.items() if observe}
+        assert said == dict.fromkeys(asked)
 
 
 def test_every_released_question_belongs_to_its_own_family_alone() -> None:

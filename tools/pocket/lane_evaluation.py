@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -22,6 +23,7 @@ RANDOM = (0, 1)  # seeds of random weights that are measured beside a model
 MAX_BATCH = 64
 PROMPT = "vqa_guided"
 FIGURES = ("within", "within_low", "auroc", "own_effect", "other_effect", "n_clips")
+SHARES = ("right", "abstained", "false_abs")
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class LaneFigures(SeedRow):
 
     weights: `model`, or `random_N`. within: share of clips with one hidden event whose hidden question is scored above
     the other; the rest as in the table `interaction`. right: share of questions answered right that can be answered;
-    abstained: of those that cannot; false_abs: abstentions among the first.
+    abstained: of those that cannot; false_abs: abstentions among the first. Random weights are not asked (nan).
     """
 
     COMMAND = "evaluate"
@@ -61,7 +63,7 @@ def evaluate(
         name = "model" if random is None else f"random_{random}"
         model = load_local_model(entry, seed=random)
         states, answers, asked = _asked(model, scenes, answered=random is None)
-        shares = _shares(answers, asked, scenes)
+        shares: dict[str, Any] = _shares(answers, asked, scenes) if answers else dict.fromkeys(SHARES, math.nan)
         design = LaneDesign.of([item.item_id for item, _ in asked])
         for layer in range(states.shape[1]):
             for held_out, figures in lane_metrics(states[:, layer], design, FOLDS, RESAMPLES, seed).items():
@@ -88,7 +90,7 @@ def _asked(
             for item in items
         ]
         states += [model.forward_states(prompt).raw for prompt in prompts]
-        answers += [each.text for each in model.generate(prompts, 8)] if answered else [""] * len(items)
+        answers += [each.text for each in model.generate(prompts, 8)] if answered else []
         asked += [(item, scene) for item in items]
     return np.stack(states), answers, asked
 
@@ -102,11 +104,8 @@ def _shares(answers: Sequence[str], asked: Sequence[tuple[LaneItem, int]], scene
         statement = read_statement(text, record.questions[lane])
         said.append(statement == ABSTENTION)
         right.append(statement is not None and statement.value == record.answers[lane])
-    return {
-        "right": round(float(np.mean(np.array(right)[~hidden])), 4),
-        "abstained": round(float(np.mean(np.array(said)[hidden])), 4),
-        "false_abs": round(float(np.mean(np.array(said)[~hidden])), 4),
-    }
+    parts = (np.array(right)[~hidden], np.array(said)[hidden], np.array(said)[~hidden])
+    return {name: round(float(part.mean()), 4) for name, part in zip(SHARES, parts, strict=True)}
 
 
 def markdown(rows: Sequence[LaneFigures]) -> str:

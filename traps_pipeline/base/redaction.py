@@ -1,8 +1,8 @@
 """Remove keys from text before it is printed, logged, stored or displayed.
 
-Secrets are the values of environment variables that hold keys: those that a registry names (`hide`), those that a run
-has read (`remember`), and those whose names say so. They are found verbatim, in any case, escaped, percent-encoded, in
-base64 or in hexadecimal, also when white space, quotes or line breaks split them, and when either end is cut off.
+Secrets are the values of environment variables that hold keys: those that a registry names, those that a run has read
+(`remember`), and those whose names say so. They are found verbatim, in any case, escaped, percent-encoded, in base64 or
+in hexadecimal, also when white space, quotes or line breaks split them, and when either end is cut off.
 """
 
 import logging
@@ -46,7 +46,7 @@ _values = set[str]()
 # What the needles were made of, and the needles: the environment, and how many values and variables there were.
 
 
-def hide(variable: str) -> None:
+def redact_environment_variable(variable: str) -> None:
     """Treat the value of this environment variable as a secret."""
     _variables.add(variable)
 

@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.composition import composition_problems, load_comp
 from traps_pipeline.benchmark.filmed_lanes import trajectories_of
 from traps_pipeline.benchmark.lane_balance import telling_numbers
 from traps_pipeline.benchmark.outcome_leakage import MAX_GAIN, MIN_RECORDS, outcome_leakage
-from traps_pipeline.benchmark.records import load_released, refuse_recorded, two_events_lines
+from traps_pipeline.benchmark.records import load_release, load_released, refuse_recorded, two_events_lines
 from traps_pipeline.scenes.certification.certify_lanes import certify_lane_record
 from traps_pipeline.scenes.certification.certify_record import Verdict, certify
 from traps_pipeline.scenes.draw.sample import Tally, load_tallies
@@ -30,7 +30,7 @@ from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 @dataclass(frozen=True)
 class Case:
-    """A record to certify, its trajectories' file, and the file for its verdict."""
+    """A record to certify, with the paths of its trajectories and of its cached verdict."""
 
     spec: SceneSpec | TwoEventsSpec
     trajectory: Path
@@ -50,6 +50,8 @@ def certify_all(
 
     Verdicts are cached in `cache_folder` by record and code, so that an interrupted call resumes.
     """
+    if (folder / "benchmark.yaml").is_file():
+        load_release(folder / "benchmark.yaml")  # refuses that of another version
     released_folder, lanes_folder = folder / "released", folder / "two_events" / "released"
     specs = [s for s in load_released(released_folder).values() if families is None or s.family in families]
     lines = two_events_lines(lanes_folder).values()
@@ -110,7 +112,7 @@ def judge(case: Case) -> Verdict:
 
 
 def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list[str]:
-    """Return families of 100+ cut clips whose state at the cut predicts the outcome."""
+    """Return in words the families of 100+ cut clips whose state at the cut predicts the outcome."""
     states = {verdict.scenario_id: verdict.at_cut for verdict in verdicts if len(verdict.at_cut)}
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
@@ -130,7 +132,7 @@ def foreseeable(specs: Iterable[SceneSpec], verdicts: Iterable[Verdict]) -> list
 
 
 def family_table(folder: Path, verdicts: Sequence[Verdict]) -> str:
-    """Return a table as lines of text, one line per family.
+    """Return a table of verdicts as text, one line per family.
 
     Columns: scenarios, passed, rejected draws, entropy of the futures and accuracy of the best guess, margins, twins,
     CPU seconds.

@@ -3,6 +3,7 @@
 import uuid
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
@@ -53,12 +54,13 @@ def sample_benchmark(
     Existing records of the same seed and numbers stay: an interrupted sampling resumes.
     Raises TrapsError if a family cannot be filled, or does not support a setting of the difficulty.
     """
-    require_difficulty(counts, difficulty)
+    of_pairs = replace(difficulty, window_s=DEFAULT_DIFFICULTY.window_s)
+    require_difficulty(counts, of_pairs)
     with keep_workers():
-        for family, count in counts.items():
+        for family, count in ((family, count) for family, count in counts.items() if count):
             released = out / "released"
             tally = sample_family(
-                family, count, seed, released, look=look, difficulty=difficulty, workers=workers, report=report
+                family, count, seed, released, look=look, difficulty=of_pairs, workers=workers, report=report
             )
             reasons = ", ".join(f"{n} x {reason}" for reason, n in tally.rejected.most_common()) or "none rejected"
             report(f"{family}: {count} of {count_noun(tally.draws, 'draw')}; {reasons}")
@@ -77,7 +79,7 @@ def name_benchmark(out: Path, name: str) -> None:
 
 
 def composition_problems(specs: Sequence[SceneSpec], counts: Mapping[str, int] | None = None) -> list[str]:
-    """Check all records together (numbers against `counts`); return problems in words."""
+    """Return in words what is wrong with all records together, and with their numbers against `counts`."""
     families: defaultdict[str, list[SceneSpec]] = defaultdict(list)
     for spec in specs:
         families[spec.family].append(spec)
@@ -127,7 +129,7 @@ def _constant_margin(family: str, members: Sequence[SceneSpec]) -> list[str]:
 
 
 def repeated(keys: Iterable[tuple[str, str]], problem: str) -> list[str]:
-    """Return a problem for each key that several scenarios have. keys: key and scenario id."""
+    """Return a sentence for each key that several scenarios share. keys: key and scenario id."""
     owners: defaultdict[str, list[str]] = defaultdict(list)
     for key, scenario_id in keys:
         owners[key].append(scenario_id)
@@ -135,7 +137,7 @@ def repeated(keys: Iterable[tuple[str, str]], problem: str) -> list[str]:
 
 
 def prior_accuracy(specs: Sequence[SceneSpec]) -> float:
-    """Return the accuracy of each sub-scenario's commonest answer, mean of taxonomies."""
+    """Return the accuracy of answering each sub-scenario's commonest answer, mean of taxonomies."""
     commonest = commonest_answers([spec.model_dump(mode="json") for spec in specs])
     shares = []
     for taxonomy in ("occlusion", "chaotic"):

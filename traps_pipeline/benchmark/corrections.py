@@ -1,4 +1,4 @@
-"""Fold corrections over released records; together they are a benchmark version.
+"""Apply corrections to released records; together they are a benchmark version.
 
 `scene_specs/corrections/*.jsonl` is append-only, one decision a line, read in the order of file names and lines:
 
@@ -67,7 +67,7 @@ class Correction(BaseModel):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario with its corrections; `record` is the released one, None if added.
+    """A scenario of a pair with its corrections; `record` is the released one, None if added.
 
     `params` is not None if the scene itself must be resolved again; the scene_specs stage does that.
     """
@@ -108,7 +108,7 @@ _OfFamily = TypeVar("_OfFamily", bound=_HasFamily)
 
 @dataclass(frozen=True)
 class LaneScenario:
-    """A scenario of two events with its corrections."""
+    """A scenario of two events, each in a lane of one picture, with its corrections."""
 
     record: ReleasedLine[TwoEventsSpec]
     words: Mapping[str, Any] = field(default_factory=dict)
@@ -153,7 +153,7 @@ def apply_words(spec: _Spec, words: Mapping[str, Any], where: str) -> _Spec:
 
 
 def read_corrections(folder: Path = CORRECTIONS) -> list[tuple[str, Correction]]:
-    """Return all decisions with `file:line`. Raises TrapsError naming the line."""
+    """Return all decisions, each with its place `file:line`. Raises TrapsError naming the line."""
     corrections = []
     for path in sorted(folder.glob("*.jsonl")):
         for number, line in read_lines(path):
@@ -283,18 +283,18 @@ def _add(where: str, correction: Correction) -> Scenario:
 
 
 def load_scenarios(study: Study) -> dict[str, Scenario]:
-    """Return a study's corrected subset. Raises TrapsError for unknown scenarios."""
+    """Return by id the scenarios of a study, after corrections. Raises TrapsError for unknown ones."""
     check_benchmark(study)
     return of_study(corrected_scenarios(), study)
 
 
 def current_benchmark() -> str:
-    """Return the name of the benchmark whose records are active."""
+    """Return the name of the benchmark whose records this process reads."""
     return "released" if SCENE_SPECS == OWN_SPECS else load_release().name
 
 
 def check_benchmark(study: Study) -> None:
-    """Raise TrapsError unless the active records are of the study's benchmark."""
+    """Raise TrapsError unless the records that are read are of the study's benchmark."""
     current = current_benchmark()
     if study.benchmark != current:
         raise TrapsError(
@@ -311,24 +311,24 @@ def _records_advice(benchmark: str) -> str:
 
 @cache
 def corrected_scenarios() -> dict[str, Scenario]:
-    """Return the released records after all corrections."""
+    """Return the released scenarios of pairs by id, after all corrections."""
     return apply_corrections(released_lines(), of_pairs(read_corrections()))
 
 
 def of_pairs(corrections: Iterable[tuple[str, Correction]]) -> list[tuple[str, Correction]]:
-    """Return the decisions that are not about scenarios of two events."""
+    """Return the decisions about scenarios of pairs: all but those of two events."""
     lanes = two_events_lines()
     return [(where, correction) for where, correction in corrections if correction.scenario_id not in lanes]
 
 
 @cache
 def corrected_two_events() -> dict[str, LaneScenario]:
-    """Return the released records of two events after all corrections."""
+    """Return the released scenarios of two events by id, after all corrections."""
     return apply_to_lanes(two_events_lines(), read_corrections())
 
 
 def load_two_events(study: Study) -> dict[str, LaneScenario]:
-    """Return a study's corrected subset of scenarios of two events."""
+    """Return by id the scenarios of two events of a study, after corrections."""
     check_benchmark(study)
     return of_study(corrected_two_events(), study, two_events_lines())
 

@@ -19,6 +19,7 @@ from traps_pipeline.base.files import sync_folder
 from traps_pipeline.base.paths import CORRECTIONS, require_own_corrections
 from traps_pipeline.benchmark.corrections import (
     Correction,
+    LaneScenario,
     Scenario,
     apply_corrections,
     apply_to_lanes,
@@ -34,7 +35,7 @@ Sign = Callable[..., Correction]
 
 
 class DecidedMeanwhile(TrapsError):
-    """Another reviewer has decided about the scenario since this one looked at it."""
+    """Raised where another reviewer has decided about a scenario since this one looked at it."""
 
 
 def decisions_on(scenario_id: str, folder: Path = CORRECTIONS) -> list[Correction]:
@@ -59,7 +60,7 @@ def save_decision(correction: Correction, n_seen: int, folder: Path = CORRECTION
 
 
 def undo_decision(scenario_id: str, n_seen: int, *, who: str, why: str, folder: Path = CORRECTIONS) -> None:
-    """Append decisions that take back the last one about a scenario.
+    """Append decisions that cancel the last one about a scenario.
 
     Raises DecidedMeanwhile as `save_decision` does, and TrapsError if there is no decision to take back.
     """
@@ -67,30 +68,33 @@ def undo_decision(scenario_id: str, n_seen: int, *, who: str, why: str, folder: 
         decisions = _require_known(scenario_id, n_seen, folder)
         if not is_reviewed(decisions):
             raise TrapsError(f"{scenario_id}: no decision stands that could be taken back")
-        records = load_released()
         of_others = [(at, other) for at, other in read_corrections(folder) if other.scenario_id != scenario_id]
-        previous = apply_corrections(
-            records, [*of_pairs(of_others), *(("before", correction) for correction in decisions[:-1])]
-        ).get(scenario_id)
+        before = [*of_others, *(("before", correction) for correction in decisions[:-1])]
+        records, lanes = load_released(), two_events_lines()
+        previous = apply_to_lanes(lanes, before).get(scenario_id)
+        previous = previous or apply_corrections(records, of_pairs(before)).get(scenario_id)
 
         def sign(action: str, **changes: Any) -> Correction:
             signature = {"who": who, "when": date.today(), "why": why}
             return Correction.model_validate({"scenario_id": scenario_id, "action": action, **changes, **signature})
 
-        append(_bring_back(scenario_id in records, previous, was_reviewed=is_reviewed(decisions[:-1]), sign=sign))
+        was_reviewed, is_released = is_reviewed(decisions[:-1]), scenario_id in {*records, *lanes}
+        append(_bring_back(is_released, previous, was_reviewed=was_reviewed, sign=sign))
 
 
-def _bring_back(is_released: bool, previous: Scenario | None, *, was_reviewed: bool, sign: Sign) -> list[Correction]:
+def _bring_back(
+    is_released: bool, previous: Scenario | LaneScenario | None, *, was_reviewed: bool, sign: Sign
+) -> list[Correction]:
     """Return decisions that restore a scenario's state, reviewed only if it was."""
+    params = getattr(previous, "params", None)
     if not is_released:
         if previous is None:
             return [sign("discard")]  # undo an addition
-        changes = {**previous.words, "params": dict(previous.params or {})}
-        return [sign("correct", **changes)]
+        return [sign("correct", **previous.words, params=dict(params or {}))]
     decisions = [sign("restore")]
     if previous is None:
         return [*decisions, sign("discard")]
-    changes = dict(previous.words) | ({} if previous.params is None else {"params": dict(previous.params)})
+    changes = dict(previous.words) | ({} if params is None else {"params": dict(params)})
     if changes:
         return [*decisions, sign("correct", **changes)]
     return [*decisions, sign("keep")] if was_reviewed else decisions

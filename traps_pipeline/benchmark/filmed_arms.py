@@ -1,4 +1,4 @@
-"""Render and certify, once, the arms that a study asks for (docs/arms.md)."""
+"""Render and certify, once, the clips of the arms (datasets beside the pairs) that a study asks for."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from traps_pipeline.scenes.variants.arms import ARMS as SHORTCUT_ARMS
 from traps_pipeline.scenes.variants.arms import Arm, Question, Scenario
 from traps_pipeline.scenes.variants.graded_cuts import GRADED_CUT
 from traps_pipeline.scenes.variants.variations import VARIATIONS
-from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import Clip, clip_note_path, read_clip, save_clip
 from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
@@ -40,7 +40,7 @@ _RESULT_SUFFIX = ".arm.json"  # suffix of the files with an arm's result
 
 @dataclass(frozen=True)
 class ArmResult:
-    """An arm's stored result beside its clip; `of` is the digest of record and code."""
+    """The stored result of rendering an arm's clip; `of` is the digest of record and code."""
 
     of: str
     refused: str | None
@@ -49,7 +49,7 @@ class ArmResult:
 
     @staticmethod
     def read(path: Path, of: str) -> ArmResult | None:
-        """Return the stored result if it is of this record and this code, else None."""
+        """Return the result stored in a file if it is of this record and this code, else None."""
         if not path.is_file():
             return None
         result = ArmResult(**json.loads(path.read_text(encoding="utf-8")))
@@ -58,7 +58,7 @@ class ArmResult:
 
 @dataclass(frozen=True)
 class Job:
-    """A scenario's arms to render: clip paths by arm, and trajectories (F, nq)."""
+    """A scenario's clips of arms to render: paths by arm, and trajectories (F, nq)."""
 
     spec: SceneSpec
     qpos: np.ndarray
@@ -67,18 +67,18 @@ class Job:
 
 
 def asked_arms(workspace: Workspace, category: str) -> list[str]:
-    """Return a category's arms and variations that some experiment requests."""
+    """Return the names of a category's arms and variations that some experiment requests."""
     datasets = {dataset for experiment in workspace.study.experiments.values() for dataset in experiment.datasets}
     return [arm for arm in arms_of_category(category) if arm in datasets]
 
 
 def arms_of_pairs(workspace: Workspace, category: str) -> list[str]:
-    """Return which of these arms are filmed from scenarios of pairs."""
+    """Return the names of the requested arms whose clips are rendered from scenarios of pairs."""
     return [arm for arm in asked_arms(workspace, category) if arm != TWO_EVENTS]
 
 
 def asked_lanes(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]:
-    """Return a category's records of two events, if some experiment requests them."""
+    """Return by id a category's records of two events; none if no experiment requests them."""
     return lane_specs(workspace, category) if TWO_EVENTS in asked_arms(workspace, category) else {}
 
 
@@ -125,7 +125,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_arms(workspace: Workspace, category: str) -> list[ArmRow]:
-    """Return a category's arms. Raises TrapsError for a missing or damaged one."""
+    """Return a category's rows of the table of arms. Raises TrapsError for a missing or damaged clip."""
     specs, arms = spec_rows(workspace, category), arms_of_pairs(workspace, category)
     pair_clips = {
         (row["scenario_id"], row["side"]): row
@@ -150,7 +150,7 @@ def _is_missing(row: Row, clips: Mapping[str, Path], existing: set[Path]) -> boo
     spec = spec_of(row)
     for arm, clip in clips.items():
         result = ArmResult.read(_finding_of(clip), _record_digest(spec, arm)) if _finding_of(clip) in existing else None
-        if result is None or (result.frames and not {clip, note_of(clip)} <= existing):
+        if result is None or (result.frames and not {clip, clip_note_path(clip)} <= existing):
             return True
     return False
 
@@ -161,7 +161,7 @@ def _finding_of(clip: Path) -> Path:
 
 def _files(clip: Path) -> tuple[Path, ...]:
     """Return an arm's files: its clip with the note (none if refused), and the result."""
-    return clip, note_of(clip), _finding_of(clip)
+    return clip, clip_note_path(clip), _finding_of(clip)
 
 
 @cache
@@ -182,7 +182,7 @@ def _is_made(spec: SceneSpec, arm: str, clip: Path) -> bool:
 
 
 def film(job: Job) -> int:
-    """Render and certify a scenario's missing arms; return the number of frames."""
+    """Render and certify a scenario's missing clips of arms; return the number of frames drawn."""
     scenario, frame_count = Scenario.of_record(job.spec, job.qpos, job.twin), 0
     for arm, clip in job.clips.items():
         record_digest = _record_digest(job.spec, arm)
@@ -258,7 +258,7 @@ def _pair_clip_columns(row: Row) -> dict[str, Any]:
 
 
 def incomplete_reasons(workspace: Workspace, category: str) -> list[str]:
-    """Return why a category's table is incomplete: a new arm or a lost clip."""
+    """Return in words why a category's table of arms is incomplete: a new arm or a lost clip."""
     rows = workspace.tables.read(ARMS, {"category": category}, ["arm", "clip"])
     arms_in_table = set(rows["arm"])
     expected = [*arms_of_pairs(workspace, category), *([TWO_EVENTS] if asked_lanes(workspace, category) else [])]

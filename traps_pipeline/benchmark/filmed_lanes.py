@@ -19,7 +19,7 @@ from traps_pipeline.benchmark.versions import version_of
 from traps_pipeline.protocol.datasets import TWO_EVENTS
 from traps_pipeline.protocol.two_events import CLIPS, LANES
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, save_clip
+from traps_pipeline.scenes.worlds.clip_notes import clip_note_path, read_clip, save_clip
 from traps_pipeline.scenes.worlds.lane_records import RecordedEvents, TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import load_trajectory
 from traps_pipeline.storage.benchmark_tables import ArmRow
@@ -30,7 +30,7 @@ SECONDS_A_CLIP = 1.9  # measured on one core (docs/engineering-notes.md)
 
 @dataclass(frozen=True)
 class LaneJob:
-    """A scenario's missing clips, by the lanes that are hidden, and its trajectory (F, nq)."""
+    """A scenario's missing clips, by the lanes that boards hide in them, and its trajectory (F, nq)."""
 
     spec: TwoEventsSpec
     qpos: np.ndarray
@@ -38,13 +38,13 @@ class LaneJob:
 
 
 def lane_specs(workspace: Workspace, category: str) -> dict[str, TwoEventsSpec]:
-    """Return a category's records of two events in the study, after corrections."""
+    """Return by id a category's records of two events in the study, after corrections."""
     scenarios = load_two_events(workspace.study).items()
     return {id_: scenario.spec for id_, scenario in scenarios if scenario.category == category}
 
 
 def lanes_version(workspace: Workspace, categories: Sequence[str]) -> str:
-    """Return the version of some categories' records of two events."""
+    """Return the version (digest) of some categories' records of two events."""
     released = of_study(two_events_lines(), workspace.study, two_events_lines())
     current = [spec for category in categories for spec in lane_specs(workspace, category).values()]
     return version_of(
@@ -54,7 +54,7 @@ def lanes_version(workspace: Workspace, categories: Sequence[str]) -> str:
 
 
 def trajectories_of(spec: TwoEventsSpec, path: Path | None = None) -> dict[str, np.ndarray]:
-    """Return a record's trajectories by name: `qpos`, and those with a lane's twin. Raises ValueError.
+    """Return a record's trajectories by name: `qpos`, and those where a lane differs. Raises ValueError.
 
     path: of their file, by default the released one.
     """
@@ -71,7 +71,8 @@ def film_lanes(
     rows: list[Row] = [{"scenario_id": id_} for id_ in specs]
 
     def files(row: Row) -> list[Path]:
-        return [file for clip in lane_paths(workspace, specs[row["scenario_id"]]) for file in (clip, note_of(clip))]
+        clips = lane_paths(workspace, specs[row["scenario_id"]])
+        return [file for clip in clips for file in (clip, clip_note_path(clip))]
 
     def missing(rows: Sequence[Row]) -> list[Row]:
         existing = workspace.store.there(file for row in rows for file in files(row))
@@ -97,7 +98,7 @@ def film_lanes(
 
 
 def film(job: LaneJob) -> int:
-    """Render a scenario's missing clips; return the number of frames."""
+    """Render a scenario's missing clips; return the number of frames drawn."""
     world = job.spec.world(job.qpos)
     with Renderer(world.model, world.camera) as renderer:
         return sum(
@@ -107,7 +108,7 @@ def film(job: LaneJob) -> int:
 
 
 def lane_rows(workspace: Workspace, category: str, specs: Mapping[str, TwoEventsSpec]) -> Iterator[ArmRow]:
-    """Yield eight rows of each of a category's records. Raises TrapsError for a missing or damaged clip."""
+    """Yield the eight rows of each record of two events. Raises TrapsError for a missing or damaged clip."""
     version = lanes_version(workspace, [category])
     clips = existing_clips(workspace.store, [path for spec in specs.values() for path in lane_paths(workspace, spec)])
     for spec in specs.values():
@@ -149,5 +150,5 @@ def _clips(workspace: Workspace, spec: TwoEventsSpec) -> dict[str, Path]:
 
 
 def lane_paths(workspace: Workspace, spec: TwoEventsSpec) -> list[Path]:
-    """Return the paths of a record's four clips."""
+    """Return the paths of the four clips of a record of two events."""
     return [*_clips(workspace, spec).values()]

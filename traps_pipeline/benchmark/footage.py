@@ -29,12 +29,12 @@ _EPS = 1e-3  # s: containers round times to a millisecond
 
 
 class UnusableFootage(ValueError):
-    """A video that makes no clip; the message says what is wrong, and what to do."""
+    """Raised for a video that makes no clip; the message says what is wrong, and what to do."""
 
 
 @dataclass(frozen=True)
 class Footage:
-    """A clip's frames (H, W, 3) uint8 RGB, FPS a second; the size as seen (px), and what was changed, in words."""
+    """A clip cut from a video: frames (H, W, 3) uint8 RGB, its size in px, and in words what was changed."""
 
     frames: list[np.ndarray]
     seen: tuple[int, int]
@@ -42,7 +42,7 @@ class Footage:
 
 
 def read_footage(path: Path, start_s: float = 0.0, end_s: float | None = None) -> Footage:
-    """Read a video's frames from `start_s` to `end_s` (default: to its end). Raises UnusableFootage."""
+    """Return a video's frames from `start_s` to `end_s` (default: to its end). Raises UnusableFootage."""
     import av
     from av.error import FFmpegError
 

@@ -79,7 +79,7 @@ def _of_user(name: str) -> Path:
 
 
 def held_out_items(study: Path) -> dict[str, str]:
-    """Return the item of each scenario that was released without its answer."""
+    """Return by scenario the id of the item that was released without its answer."""
     items = dict[str, str]()
     for path in _markers(study):
         if path.is_file():
@@ -131,7 +131,7 @@ def require_secret_seed(benchmark: Path) -> None:
 
 
 def begin_publication(study: Path, output: str) -> None:
-    """Note that an output with sides is published; raise TrapsError if items of the study are held out."""
+    """Note that an output that tells sides is published; raise TrapsError if items are held out."""
     for path in _markers(study):
         if path.is_file():
             raise TrapsError(

@@ -44,7 +44,7 @@ def categories_of_dataset(dataset: str) -> list[str]:
 
 
 def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
-    """Return a dataset's items, with clips verified by digest. Raises TrapsError."""
+    """Return a dataset's rows of ITEMS, with clips verified by digest. Raises TrapsError."""
     specs: list[Record] = []
     clips: dict[tuple[str, str], Record] = {}
     for category in categories_of_dataset(dataset):
@@ -73,7 +73,7 @@ def build_items(workspace: Workspace, dataset: str) -> list[ItemRow]:
 
 
 def expected_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return a dataset's items as a run would build them, without building any.
+    """Return a dataset's rows of ITEMS as a run would build them, without building any.
 
     It uses the clips that exist: items whose clip must be rendered first are left out, and of arms those of changed
     scenarios. Raises TrapsError.
@@ -266,7 +266,7 @@ _DECISIVE = (
 
 
 def item_hash(row: Record) -> str:
-    """Return the digest of all that decides an item's answer or score."""
+    """Return the digest of everything that decides an item's answer or score."""
     decisive = {name: row[name] for name in _DECISIVE}
     return digest(decisive | {"labels": list(row["labels"]), "aliases": json.loads(row["aliases"])})
 

@@ -1,4 +1,4 @@
-"""Measure that nothing in view tells hidden lanes of two events from seen ones."""
+"""Measure that nothing in view tells events that a board hides from events that are seen."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -16,7 +16,7 @@ LARGEST_AUC, LARGEST_FAMILY_AUC, FAMILY_LANES = 0.6, 0.85, 16
 
 
 def lane_numbers(specs: Iterable[TwoEventsSpec]) -> pd.DataFrame:
-    """Return a row per lane, seen and hidden: family, side, and numbers of what its clip shows.
+    """Return a frame with a row per lane, seen and hidden: family, side, and numbers of what its clip shows.
 
     Boards: whether one comes, moves and stands, at fixed shares of the clip and in all; pixels of boards and of things
     like the asked one. Where boards are follows from the side, so the two sides have the same timetable.
@@ -44,7 +44,7 @@ def _rows(spec: TwoEventsSpec) -> Iterator[dict[str, object]]:
 
 
 def balance(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return for each number its mean on both sides and its AUC, over all lanes and in the family that it tells most.
+    """Return a frame with a row per number: its mean on both sides, and its AUC over all lanes and in one family.
 
     AUC: the probability that a hidden lane has more of it than a seen one; .5 tells nothing.
     """
@@ -65,7 +65,7 @@ def balance(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def telling_numbers(specs: Iterable[TwoEventsSpec]) -> list[str]:
-    """Return a sentence for each number in view that tells hidden lanes from seen ones, over all or in a family."""
+    """Return a sentence for each number that tells hidden lanes from seen ones, over all or in a family."""
     lanes = Counter((rows := lane_numbers(specs))["family"])
     whole = rows.loc[[lanes[family] >= len(SIDES) * FAMILY_LANES for family in rows["family"]]]
     found = [(number, value, LARGEST_AUC, "") for number, value in balance(rows)[["number", "auc"]].to_numpy()]

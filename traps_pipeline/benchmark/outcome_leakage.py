@@ -18,7 +18,7 @@ MIN_RECORDS = 100  # records of a family; fewer cannot tell such a leakage from 
 def outcome_leakage(
     states: Sequence[Sequence[float] | np.ndarray], outcomes: Sequence[str]
 ) -> tuple[float, float] | None:
-    """Return how often outcomes are predicted from records' states, and by the commonest one; None if one is too rare.
+    """Return the accuracies of predicting outcomes from states, and by the commonest one; None if one is too rare.
 
     The first is the accuracy of the better of two cross-validated classifiers, which favours them.
     """

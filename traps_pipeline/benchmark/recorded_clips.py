@@ -14,8 +14,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.benchmark.footage import FPS, Footage, UnusableFootage, read_footage
 from traps_pipeline.benchmark.recorded_pairs import Board, RecordedPair
 from traps_pipeline.protocol.two_events import CLIPS as LANE_CLIPS
-from traps_pipeline.scenes.parts.look import LINE_SHARE, OCCLUDERS, occluder_tones
-from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip
+from traps_pipeline.scenes.worlds.clip_notes import clip_note_path, read_clip
 from traps_pipeline.video.encode import DamagedClip
 
 FALL_S = 0.5  # in which a board comes, gaining speed evenly; the released boards fall for 0.39 to 0.61 s
@@ -25,7 +24,7 @@ BOARD_TONE = 0.86  # of its colour under the simulator's light
 
 @dataclass(frozen=True)
 class RecordedClips:
-    """A scenario's clips by side, each frames (H, W, 3); how the void hides; evidence and remarks on them."""
+    """The frames (H, W, 3) of a recorded scenario's clips by side, how the void hides, evidence and remarks."""
 
     clips: dict[str, list[np.ndarray]]
     void: dict[str, Any]
@@ -34,7 +33,7 @@ class RecordedClips:
 
 
 def make_clips(pair: RecordedPair, folder: Path) -> RecordedClips:
-    """Cut a recorded pair's two clips from its videos. Raises UnusableFootage naming the clip that cannot be made."""
+    """Return a recorded pair's clips, cut from its videos. Raises UnusableFootage naming a clip that cannot be made."""
     files = {side: name for side in ("control", "void", "twin") if (name := getattr(pair, side)) is not None}
     footage, originals, notes = dict[str, Footage](), dict[str, str](), list[str]()
     for side, name in files.items():
@@ -148,10 +147,12 @@ def _covered(control: Footage, pair: RecordedPair, boards: Iterable[Board]) -> l
 
 def _panel(width: int, height: int, name: str) -> np.ndarray:
     """Return a board's picture, in a colour of the simulated ones: slats under a paler upper edge."""
+    from traps_pipeline.scenes.parts.look import LINE_SHARE, OCCLUDERS, occluder_texture  # takes long to import
+
     colours = [*OCCLUDERS.values()]
     colour = BOARD_TONE * np.array(colours[int(digest(name)[:8], 16) % len(colours)])
     down = np.arange(height) - height // 2
-    panel = occluder_tones(colour, (down >= 0) & (down < max(1, round(LINE_SHARE * height / 2))))
+    panel = occluder_texture(colour, (down >= 0) & (down < max(1, round(LINE_SHARE * height / 2))))
     panel[: max(2, round(EDGE_SHARE * height))] = np.rint(255 * EDGE_TONE * colour)
     return np.repeat(panel[:, None], width, axis=1)
 
@@ -170,12 +171,12 @@ def _twin_proof(pair: RecordedPair, twin: Footage, hiding: dict[str, Any], void:
 
 
 def clip_path(folder: Path, scenario_id: str, side: str) -> Path:
-    """Return the place of a recorded clip below a folder of released records."""
+    """Return the path of a recorded clip below a folder of released records."""
     return folder / "clips" / scenario_id / f"{side}.mp4"
 
 
 def is_whole(path: Path, sha256: str) -> bool:
-    """Return whether a clip with its note is there, and is the one that was imported."""
+    """Return whether a clip and its note exist, and it is the one that was imported."""
     with suppress(DamagedClip):
         return (clip := read_clip(path)) is not None and clip.file_sha256 == sha256
     return False
@@ -191,4 +192,4 @@ def copy_clips(released: Path, scenario_id: str, clips: Mapping[str, str], targe
         if not is_whole(clip, clips[side]):
             raise TrapsError(f"{clip}: is missing or not the clip that was imported; import the folder again")
         write_bytes(target, clip.read_bytes())
-        write_bytes(note_of(target), note_of(clip).read_bytes())
+        write_bytes(clip_note_path(target), clip_note_path(clip).read_bytes())

@@ -38,7 +38,7 @@ def _aliases(value: Any) -> Any:
 
 
 class Board(NamedTuple):
-    """A board over a part of the picture (px of the original as it is seen), between two times (s)."""
+    """A board drawn over a part of the picture (px of the original as it is seen), between two times (s)."""
 
     from_s: Seconds
     to_s: Annotated[float, Field(gt=0)]
@@ -54,7 +54,7 @@ Texts = Annotated[list[Text], _split("|")]
 
 
 class RecordedPair(BaseModel):
-    """A line of the table: a scenario, its clips, its words, and how it becomes unknowable."""
+    """A line of the table: a scenario, its clips, its words, and how its outcome is hidden."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     id: str = Field(pattern=Slug, max_length=80, description="as cars-0001")

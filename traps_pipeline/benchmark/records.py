@@ -13,7 +13,7 @@ from pydantic_core import from_json
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.names import Name
-from traps_pipeline.base.paths import RELEASED, SCENE_SPECS, TWO_EVENTS_RELEASED
+from traps_pipeline.base.paths import OWN_SPECS, RELEASED, SCENE_SPECS, SPECS_VARIABLE, TWO_EVENTS_RELEASED
 from traps_pipeline.base.yamlfile import check_line, faults_of, parse_yaml_model, read_unchecked_lines, read_yaml
 from traps_pipeline.protocol.datasets import ALL_CATEGORIES, RECORDED
 from traps_pipeline.scenes.family_registry import family_names
@@ -27,7 +27,7 @@ NOT_MIXED = "holds simulated records, and recorded ones are never averaged with 
 
 
 class Release(BaseModel):
-    """`scene_specs/benchmark.yaml`: the name, and a canary for contamination checks."""
+    """The contents of `scene_specs/benchmark.yaml`: the name, and a canary for contamination checks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: Name
@@ -37,13 +37,19 @@ class Release(BaseModel):
 
 @cache
 def load_release(path: Path = SCENE_SPECS / "benchmark.yaml") -> Release:
-    """Return name and version of the released benchmark."""
-    return parse_yaml_model(Release, read_yaml(path), path)
+    """Return name and version of the released benchmark. Raises TrapsError for another version of the package's own."""
+    release, own = (parse_yaml_model(Release, read_yaml(file), file) for file in (path, OWN_SPECS / "benchmark.yaml"))
+    if release.name == own.name and release.version != own.version:
+        raise TrapsError(
+            f"{path}: these are records of {release.name} {release.version}, and this is the package of {own.version}, "
+            f"which draws them otherwise: install the package of {release.version}, or unset {SPECS_VARIABLE}"
+        )
+    return release
 
 
 @dataclass(frozen=True)
 class ReleasedLine(Generic[Record]):
-    """A line of a released record, checked and parsed when `spec` is asked for.
+    """A line of a file of released records, parsed and checked when `spec` is read.
 
     A command of a small study asks for a few of hundreds, and parsing all takes longer than all else it does.
     """
@@ -70,8 +76,9 @@ def load_released(folder: Path = RELEASED) -> dict[str, SceneSpec]:
 
 @cache
 def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine[SceneSpec]]:
-    """Return lines of released records by id. Raises TrapsError with file and remedy."""
-    if records := _lines(folder, parse_record):
+    """Return lines of the released records by id; none beside two events alone. Raises TrapsError with remedy."""
+    records = _lines(folder, parse_record)
+    if records or two_events_lines(folder.parent / "two_events" / folder.name):
         return records
     raise TrapsError(
         f"{folder}: holds no released records; restore it from git or draw some with `traps benchmark sample`"
@@ -80,7 +87,7 @@ def released_lines(folder: Path = RELEASED) -> dict[str, ReleasedLine[SceneSpec]
 
 @cache
 def two_events_lines(folder: Path = TWO_EVENTS_RELEASED) -> dict[str, ReleasedLine[TwoEventsSpec]]:
-    """Return lines of the released records of two events by id; none in a benchmark without them."""
+    """Return by id the lines of the released records of two events; none in a benchmark without them."""
     return _lines(folder, parse_two_events)
 
 
@@ -100,12 +107,12 @@ def _lines(folder: Path, parse: Callable[[str, str], Record]) -> dict[str, Relea
 
 
 def is_recorded(folder: Path = RELEASED) -> bool:
-    """Return whether a benchmark's pairs are recorded: it holds one kind."""
-    return next(iter(released_lines(folder).values())).family == RECORDED
+    """Return whether a benchmark's pairs are recorded videos; no benchmark has both kinds."""
+    return any(line.family == RECORDED for line in released_lines(folder).values())
 
 
 def refuse_recorded(what: str, folder: Path = RELEASED) -> None:
-    """Raise TrapsError, once, for what needs the physics that recorded pairs do not have."""
+    """Raise TrapsError for work that needs the physics of scenes, which recorded pairs do not have."""
     if is_recorded(folder):
         raise TrapsError(f"{what}: not for recorded pairs, which nobody simulated; leave it out (docs/recorded.md)")
 

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.workers import run_in_order
-from traps_pipeline.scenes.worlds.clip_notes import Clip, check_clip, note_of, read_note
+from traps_pipeline.scenes.worlds.clip_notes import Clip, check_clip, clip_note_path, read_note
 from traps_pipeline.storage.leases import POLL_S
 from traps_pipeline.storage.store import Lease, Store
 from traps_pipeline.video.encode import DamagedClip
@@ -25,7 +25,7 @@ Job = TypeVar("Job")
 
 @dataclass(frozen=True)
 class RenderWork(Generic[Job]):
-    """The work to do for rows of scene_specs.
+    """The rendering of the clips of rows of SCENE_SPECS, as functions.
 
     name: the work's name, the same on every host. missing: returns the rows with missing files. files: the study's
     files of a finished row. job: returns what to draw for a row (None: nothing), after existing files were fetched.
@@ -42,7 +42,7 @@ class RenderWork(Generic[Job]):
 def make_together(
     store: Store, rows: Sequence[Row], filming: RenderWork[Job], tick: Callable[[int], None], *, wait: bool = True
 ) -> tuple[int, bool]:
-    """Make the missing files of rows, concurrently with other processes.
+    """Render the missing files of rows, concurrently with other processes.
 
     Return the number of frames drawn here, and whether all files exist. wait: return only then; otherwise as soon as
     other processes hold everything that is missing. tick: receives the number of finished rows. Raises TrapsError, also
@@ -109,9 +109,9 @@ class _Sharing(Generic[Job]):
 
 
 def existing_clips(store: Store, clips: Iterable[Path]) -> dict[Path, Clip]:
-    """Return existing clips' notes, unfetched. Raises TrapsError if one differs."""
+    """Return the notes of existing clips by path, without fetching clips. Raises TrapsError if a clip differs."""
     paths = [*clips]
-    store.bring(map(note_of, paths))
+    store.bring(map(clip_note_path, paths))
     digests = store.digests(paths)
     try:
         notes = {path: note for path in digests if (note := read_note(path)) is not None}

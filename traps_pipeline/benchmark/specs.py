@@ -36,14 +36,14 @@ SECONDS_A_RECORD = 0.04  # measured on one core: read a scenario's trajectories,
 
 @dataclass(frozen=True)
 class ResolvedScenario:
-    """A record and the file of its trajectory."""
+    """A record and the path of its trajectory."""
 
     spec: SceneSpec
     trajectory: Path
 
 
 def resolve_scenario(workspace: Workspace, scenario: Scenario) -> ResolvedScenario:
-    """Return the corrected record; simulate a changed or added scene once."""
+    """Return the corrected record and its trajectory; a changed or added scene is simulated once."""
     if scenario.params is None:
         spec = scenario.changed_words()
         if spec.is_recorded:
@@ -105,7 +105,7 @@ def _wording(scenario: Scenario, params: Mapping[str, Any]) -> Wording:
 
 
 def wording_of(family_name: str, seed: int, scenario_id: str, params: Mapping[str, Any]) -> Wording:
-    """Return the question and labels of a scenario, which seed and id determine.
+    """Return the question and labels of a scenario, drawn by its seed and id.
 
     Raises ValueError or TypeError if the family has no such parameters.
     """
@@ -152,7 +152,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow], list[ResolvedScenario]]:
-    """Return a category's rows and resolved records, with trajectories verified."""
+    """Return a category's rows of SCENE_SPECS and resolved records, with trajectories verified."""
     scenarios = [s for s in load_scenarios(workspace.study).values() if s.category == category]
     resolved_scenarios = [resolve_scenario(workspace, scenario) for scenario in scenarios]
     released_specs = released_in_study(workspace, category).values()
@@ -169,12 +169,12 @@ def build_specs(workspace: Workspace, category: str) -> tuple[list[SceneSpecRow]
 
 
 def spec_rows(workspace: Workspace, category: str) -> list[dict[str, Any]]:
-    """Return a category's rows of scene_specs."""
+    """Return a category's stored rows of SCENE_SPECS."""
     return workspace.tables.read(SCENE_SPECS, {"category": category}).to_dict("records")
 
 
 def clips_version(workspace: Workspace, category: str, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the version of a category's clips, by its rows of scene_specs."""
+    """Return the version of a category's clips, from its rows of SCENE_SPECS."""
     released_specs = released_in_study(workspace, category).items()
     return version_of(
         ([id_, spec.scene_hash] for id_, spec in released_specs),
@@ -183,7 +183,7 @@ def clips_version(workspace: Workspace, category: str, rows: Sequence[Mapping[st
 
 
 def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
-    """Return the rows of scene_specs that a run would build for a category now.
+    """Return the rows of SCENE_SPECS that a run would build for a category now.
 
     Nothing is simulated or written: a scenario whose parameters were never simulated is left out. Raises TrapsError.
     """
@@ -198,7 +198,7 @@ def expected_specs(workspace: Workspace, category: str) -> list[SceneSpecRow]:
 
 
 def released_in_study(workspace: Workspace, category: str) -> dict[str, SceneSpec]:
-    """Return a category's released records in the study, as without corrections."""
+    """Return by id a category's released records in the study, uncorrected."""
     records = of_study(released_lines(), workspace.study)
     return {id_: record.spec for id_, record in sorted(records.items()) if record.category == category}
 
@@ -252,7 +252,7 @@ def _relative(path: Path, *roots: Path) -> str:
 
 
 def spec_of(row: Mapping[str, Any]) -> SceneSpec:
-    """Return the record that a row of scene_specs holds."""
+    """Return the record that a row of SCENE_SPECS holds."""
     record = {name: row[name] for name in SceneSpec.model_fields}
     for name in (*_AS_JSON, "evidence"):
         record[name] = json.loads(record[name])
@@ -272,7 +272,7 @@ def trajectory_of(workspace: Workspace, row: Mapping[str, Any], world: str = "qp
 
 
 def unsettled_outcomes(resolved: Sequence[ResolvedScenario]) -> list[str]:
-    """Return problems of outcomes, recomputed from the frozen trajectories.
+    """Return in words which outcomes differ when recomputed from the frozen trajectories.
 
     A file in the user's cache folder names the records that were found settled here by the same code, so that a
     corrected question replays no scene: importing and compiling MuJoCo's models takes half a second.

@@ -17,7 +17,7 @@ _NO_FRAMES = np.empty((0, 0), np.float32)  # words are certified without a traje
 
 
 def failed_certificates(specs: Iterable[SceneSpec], *about: About) -> list[str]:
-    """Return certificates about these subjects that the stored evidence fails, one sentence each."""
+    """Return a sentence for each certificate about these subjects that the stored evidence fails."""
     judged = ((spec.scenario_id, *parts) for spec in specs for parts in judged_certificates(spec, *about))
     return [f"{id_}: {certificate.name}: {failure}" for id_, certificate, _, failure in judged if failure is not None]
 

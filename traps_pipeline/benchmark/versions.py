@@ -23,7 +23,7 @@ def version_of(released: Iterable[Any], current: Iterable[Any]) -> str:
 
 
 def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
-    """Return the fields of a spec (or its row) that a dataset's version hashes."""
+    """Return the fields of a record (or its row) that a dataset's version hashes, in order."""
     aliases = record["aliases"] if isinstance(record["aliases"], dict) else json.loads(record["aliases"])
     content = [record["scenario_id"], record["scene_hash"], record["question"], list(record["labels"]), aliases]
     content.append(record["ground_truth"])
@@ -31,5 +31,5 @@ def item_content(dataset: str, record: Mapping[str, Any]) -> list[Any]:
 
 
 def spec_record(spec: SceneSpec) -> dict[str, Any]:
-    """Return a scenario's record in the form from which items' contents are digested."""
+    """Return a scenario's record as a mapping with its scene hash, as `item_content` reads it."""
     return spec.model_dump(mode="json") | {"scene_hash": spec.scene_hash}

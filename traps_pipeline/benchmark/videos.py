@@ -14,7 +14,7 @@ from traps_pipeline.benchmark.specs import clips_version, released_in_study, spe
 from traps_pipeline.protocol.datasets import RECORDED
 from traps_pipeline.scenes.parts.look import frame_size
 from traps_pipeline.scenes.worlds.clip_cache import ClipCache
-from traps_pipeline.scenes.worlds.clip_notes import Clip, note_of, read_clip
+from traps_pipeline.scenes.worlds.clip_notes import Clip, clip_note_path, read_clip
 from traps_pipeline.scenes.worlds.clips import Job, render_pair
 from traps_pipeline.storage.benchmark_tables import VideoRow
 from traps_pipeline.storage.workspace import Workspace
@@ -70,7 +70,7 @@ def seconds_left(workspace: Workspace, category: str) -> float:
 
 
 def build_videos(workspace: Workspace, category: str) -> tuple[list[VideoRow], dict[str, float]]:
-    """Return clips, and occluded voids' leaked pixels. Raises TrapsError if missing."""
+    """Return a category's VIDEOS rows, and leaked pixels by void with an occluder. Raises TrapsError without a clip."""
     specs = spec_rows(workspace, category)
     clips = existing_clips(workspace.store, (clip for row in specs for clip in _clips(workspace, row).values()))
     version = clips_version(workspace, category, specs)
@@ -90,7 +90,7 @@ def _clips(workspace: Workspace, row: Row) -> dict[str, Path]:
 
 
 def _files(workspace: Workspace, row: Row) -> list[Path]:
-    return [file for clip in _clips(workspace, row).values() for file in (clip, note_of(clip))]
+    return [file for clip in _clips(workspace, row).values() for file in (clip, clip_note_path(clip))]
 
 
 def _job(workspace: Workspace, row: Row) -> Job:

@@ -363,7 +363,7 @@ def _outcome(row: Row) -> Outcome:
 
 
 def require_sound(results: Sequence[LiveResult], goes_on: Callable[[str], bool]) -> None:
-    """Raise TrapsError naming all problems, or what was not checked unless `goes_on` says to run without."""
+    """Raise TrapsError naming every problem, or each unchecked entry unless `goes_on` accepts these."""
     messages = [f"{result.entry.id}: {problem}" for result in results for problem in result.problems]
     advice = "nothing was rendered and nothing was judged; --no-preflight runs all the same"
     if not messages:

@@ -13,8 +13,7 @@ from traps_pipeline.base.wording import count_noun
 from traps_pipeline.cli.command import FAILED, OK, Commands, integer, number, print_json
 
 if TYPE_CHECKING:
-    from traps_pipeline.release.commitment import Commitment
-    from traps_pipeline.scenes.worlds.spec import SceneSpec
+    from traps_pipeline.release.commitment import Commitment, Specs
 
 # Copied from `scenes.parts.look.PARTS` and from `scenes.parts.difficulty`, which take long to import.
 SPEEDS, MAX_DISTRACTORS = (1.0, 1.5, 2.0), 3
@@ -46,7 +45,7 @@ def add(commands: Commands) -> None:
         "--scale", type=number(0, 1000), default=1.0, help="number of scenarios, relative to the released benchmark"
     )
     parser.add_argument(
-        "--count", type=integer(1, 1_000_000), help="number of scenarios of each family, instead of --scale"
+        "--count", type=integer(0, 1_000_000), help="number of pairs of each family, instead of --scale"
     )
     parser.add_argument(
         "--two-events",
@@ -72,6 +71,13 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--speed", type=float, choices=SPEEDS, default=1.0, help="how many times as fast all happens (default: 1.0)"
+    )
+    parser.add_argument(
+        "--window",
+        type=number(0.2, 1.0),
+        default=1.0,
+        metavar="SECONDS",
+        help="for how long two events show a settled outcome, at least (default: 1; 0.2 is hard)",
     )
     parser.add_argument("--longer", action="store_true", help="longer rows, more lanes, greater counts")
     parser.add_argument("--workers", type=integer(1, 1024), help="processes (default: one per core)")
@@ -146,18 +152,21 @@ def sample(arguments: argparse.Namespace) -> int:
     if unknown:
         raise TrapsError(f"unknown families {', '.join(unknown)}; known: {', '.join(family_names())}")
     names_without_count = [name for name in names if name not in counts]
-    if names_without_count and not arguments.count:
+    if names_without_count and arguments.count is None:
         raise TrapsError(
             f"composition.yaml has no number of scenarios for {', '.join(names_without_count)}; say --count N"
         )
-    targets = {name: arguments.count or max(1, round(counts[name] * arguments.scale)) for name in names}
+    if arguments.count == 0 and not arguments.two_events:
+        raise TrapsError("--count: 0 pairs are a benchmark only with --two-events N")
+    scaled = {name: max(1, round(counts.get(name, 0) * arguments.scale)) for name in names}
+    targets = scaled if arguments.count is None else dict.fromkeys(names, arguments.count)
     n_scenarios = sample_benchmark(
         arguments.out.absolute(),
         targets,
         arguments.seed,
         _name(arguments.name or f"private-{arguments.seed}"),
         look=arguments.look,
-        difficulty=Difficulty(arguments.distractors, arguments.speed, arguments.longer),
+        difficulty=Difficulty(arguments.distractors, arguments.speed, arguments.longer, arguments.window),
         two_events=arguments.two_events,
         workers=arguments.workers,
         report=lambda line: print(line, flush=True),
@@ -198,14 +207,11 @@ def import_pairs(arguments: argparse.Namespace) -> int:
 
 
 def commit_benchmark(arguments: argparse.Namespace) -> int:
-    from traps_pipeline.benchmark.records import two_events_lines
     from traps_pipeline.release.commitment import commit
 
     public = commit(arguments.benchmark.absolute(), arguments.out, arguments.reveal)
     records = count_noun(len(public.specs), "record")
     print(f"committed {records} of {public.name} {public.version} in {arguments.out}: publish it")
-    if lanes := two_events_lines(arguments.benchmark.absolute() / "two_events" / "released"):
-        print(f"not committed: its {count_noun(len(lanes), 'scenario')} of two events")
     print(f"keep {arguments.reveal} secret until the benchmark is revealed; without it nothing can be proven")
     return OK
 
@@ -242,11 +248,9 @@ def verify_commitment(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _redraw_problems(
-    published: Commitment, problems: list[str], specs: dict[str, SceneSpec] | None, drawn: dict[str, SceneSpec]
-) -> list[str]:
+def _redraw_problems(published: Commitment, problems: list[str], specs: Specs | None, drawn: Specs) -> list[str]:
     """Return the problems of drawn scenes, and whether only their last digits differ."""
-    from traps_pipeline.release.commitment import arithmetic_differences, is_same_scene
+    from traps_pipeline.release.commitment import environment_differences, is_same_scene
 
     if (
         problems
@@ -254,6 +258,6 @@ def _redraw_problems(
         and {*specs} == {*drawn}
         and all(is_same_scene(specs[i], drawn[i]) for i in specs)
     ):
-        machine_difference = arithmetic_differences(published) or "another kind of CPU"
+        machine_difference = environment_differences(published) or "another kind of CPU"
         problems.append(f"all scenes are the same but for the last digits of their simulation ({machine_difference})")
     return problems

@@ -51,6 +51,7 @@ def release(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> int:
+    """Write the study's ledger rows to a file, and print their number."""
     from traps_pipeline.ledger.row_transfer import export_ledger
 
     count = export_ledger(open_workspace(arguments).ledger, arguments.file.absolute(), print)
@@ -61,6 +62,7 @@ def export(arguments: argparse.Namespace) -> int:
 
 
 def import_(arguments: argparse.Namespace) -> int:
+    """Read ledger rows from a file into the study's ledger, and print their number."""
     from traps_pipeline.ledger.row_transfer import import_ledger
 
     workspace = open_workspace(arguments)

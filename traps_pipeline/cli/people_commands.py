@@ -42,6 +42,7 @@ def add(commands: Commands) -> None:
 
 
 def review(arguments: argparse.Namespace) -> int:
+    """Serve the pages on which a reviewer decides about scenarios, until Ctrl-C."""
     require_extra("web")
     from traps_pipeline.base.paths import require_own_corrections
     from traps_pipeline.servers.review import Review, review_app

@@ -121,10 +121,10 @@ def verify(arguments: argparse.Namespace) -> int:
         return verify_file(arguments.path, arguments.release, is_json=arguments.json)
     problems = altered_files(arguments.path)
     if arguments.key:
-        from traps_pipeline.release.signing import check_signature
+        from traps_pipeline.release.signing import signature_problem
 
-        signature_problem = check_signature(arguments.path, arguments.key)
-        problems += [signature_problem] if signature_problem else []
+        problem = signature_problem(arguments.path, arguments.key)
+        problems += [problem] if problem else []
     if arguments.json:
         print_json({"problems": problems, "files": len(read_checksums(arguments.path))})
         return FAILED if problems else OK

@@ -145,9 +145,9 @@ def run(arguments: argparse.Namespace) -> int:
         board = workspace.tables.read_all(LEADERBOARD)
         print_json({"workspace": str(workspace.place), "run": report, "leaderboard": board})
     if not arguments.json and arguments.until is None and report.has_board:
-        from traps_pipeline.report.printed_board import printed_board
+        from traps_pipeline.report.printed_board import stored_leaderboard_text
 
-        print(printed_board(workspace))
+        print(stored_leaderboard_text(workspace))
         print(f"report {workspace.reports / 'report.html'}\nexplorer {workspace.reports / 'index.html'}")
         advice = "open one of them; traps why ITEM examines an item's answers; traps site writes a folder to send"
         print(wrap_text(f"next: {advice}"))

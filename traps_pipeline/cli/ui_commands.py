@@ -27,6 +27,7 @@ def add(commands: Commands) -> None:
 
 
 def ui(arguments: argparse.Namespace) -> int:
+    """Start Dagster's web server and daemon, and print the address with its token."""
     require_extra("ui")
     from traps_pipeline.base.keys import optional_key
     from traps_pipeline.base.process_tree import fork_worker

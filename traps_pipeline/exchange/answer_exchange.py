@@ -23,7 +23,7 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.wording import count_noun
 from traps_pipeline.base.yamlfile import faults_of, read_lines
 from traps_pipeline.benchmark.held_out import opaque_name
-from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, reader_of
+from traps_pipeline.exchange.harness_logs import LOG, OUTCOMES, LoggedAnswer, log_reader
 from traps_pipeline.exchange.provider_batch import export_batches, failures, is_batch, outcomes_of, read_batch
 from traps_pipeline.judging.panel import wanted_ballots
 from traps_pipeline.ledger.ledger import Ledger
@@ -224,7 +224,7 @@ def import_answers(
     requests_by_key = {request.key: request for request in requests}
     if path.suffix != LOG and is_batch(path):
         return _import_batch(workspace, workspace.answers, load_models(), requests_by_key, path)
-    reader, context = reader_of(path), context or AnswerContext()
+    reader, context = log_reader(path), context or AnswerContext()
     answers, n_failed = (
         (checked_answers(path, requests_by_key), 0)
         if reader is None

@@ -47,7 +47,7 @@ class LoggedAnswer:
     has_failed: bool = False
 
 
-def reader_of(path: Path) -> Reader | None:
+def log_reader(path: Path) -> Reader | None:
     """Return a reader of answers by item; None for answers by key, or a batch."""
     if path.suffix == LOG:
         return _eval_log

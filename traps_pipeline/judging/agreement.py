@@ -58,7 +58,7 @@ def _join(values: Iterable[str], by: str) -> str:
 
 
 def complete(values: np.ndarray) -> np.ndarray:
-    """Return the rows on which every judge cast a valid vote."""
+    """Return the rows of votes (answers, judges) on which every judge cast a valid vote."""
     return values[(values != INVALID).all(axis=1)]
 
 
@@ -108,7 +108,7 @@ def krippendorff_alpha(values: np.ndarray) -> float:
 
 
 def unanimous_share(values: np.ndarray) -> float:
-    """Return the share of unanimous rows (answers, judges); NaN if empty or one judge."""
+    """Return the share of rows (answers, judges) whose votes are equal; NaN if empty or one judge."""
     has_several_judges = len(values) and values.shape[1] > 1
     return float(np.mean((values == values[:, :1]).all(axis=1))) if has_several_judges else float("nan")
 

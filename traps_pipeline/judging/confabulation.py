@@ -43,7 +43,7 @@ MAX_TRACE = 400_000  # characters of a trace that the judge is shown
 
 @dataclass(frozen=True)
 class Failure(Call):
-    """The call to the judge about a void failure sampled out of `n_failures`."""
+    """A void answer that should have been an abstention, sampled out of `n_failures`, and the judge's call on it."""
 
     item: Mapping[str, Any]
     text: str
@@ -52,14 +52,14 @@ class Failure(Call):
 
 
 def void_kind(dataset: str) -> str:
-    """Return why the voids of a dataset cannot be answered: a key of VOID_KINDS."""
+    """Return the reason why the voids of a dataset cannot be answered: a key of VOID_KINDS."""
     if is_ill_posed(dataset):
         return "question"
     return "occluder" if dataset == "occlusion" else "truncation"
 
 
 def draw_sample(seed: int, n: int, keys: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return n keys (or all if fewer) by a seeded, order-independent draw."""
+    """Return n keys (or all if fewer), drawn by the seed; the order of `keys` plays no part."""
     return sorted(keys, key=lambda key: digest([seed, *key]))[:n]
 
 
@@ -69,7 +69,7 @@ def sample_id(cell: Cell, item_id: str, answer: str | None, trace: str | None) -
 
 
 def sample_failures(workspace: Workspace, judge: JudgeEntry, model: str) -> dict[Cell, list[Failure]]:
-    """Return a model's sample by cell; empty, with a note, while verdicts are missing."""
+    """Return the sample of a model's failures by cell; empty, with a note, while verdicts are missing."""
     protocol = load_protocol()
     cells = [cell for cell in protocol.cells(model) if workspace.tables.state(ITEMS, {"dataset": cell.dataset})]
     missing_keys = [cell.key for cell in cells if workspace.tables.state(VERDICTS, cell.partition) is None]
@@ -100,7 +100,7 @@ def _void_failures(workspace: Workspace, cell: Cell) -> list[dict[str, Any]]:
 
 
 def render(question: str, kind: str, answer: str, trace: str | None) -> str:
-    """Return the user message to the judge."""
+    """Return the user message that asks the judge to label an answer."""
     parts = [quote("reasoning trace", "TRACE", trace, MAX_TRACE)] if trace else ["No reasoning trace is given."]
     lines = [f"Question: {question}", f"Why it could not be answered: {VOID_KINDS[kind]}."]
     return "\n\n".join([*lines, *parts, quote("response", "RESPONSE", answer)])

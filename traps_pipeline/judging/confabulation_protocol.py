@@ -48,7 +48,7 @@ class Validation(BaseModel):
 
 
 class Protocol(BaseModel):
-    """The contents of `assets/confabulation.yaml`: models' samples and panels' judges."""
+    """The contents of `assets/confabulation.yaml`: how failures are sampled, and each panel's judge."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     n: int = Field(ge=1, description="failures per model; all if there are fewer")
@@ -60,11 +60,11 @@ class Protocol(BaseModel):
     validation: Validation
 
     def cells(self, model: str) -> list[Cell]:
-        """Return the cells from which a model's failures are drawn."""
+        """Return the cells (dataset, and model under a regime in a run) whose failures are sampled."""
         return [Cell(dataset, Evaluation(model, self.regime, self.run)) for dataset in DATASETS]
 
     def judge(self, panel: str) -> JudgeEntry | None:
-        """Return the judge of a study with this panel; None if there is none."""
+        """Return the entry of the judge that labels for this panel; None if the panel has none."""
         name = self.judges.get(panel)
         return load_judges()[name] if name is not None else None
 
@@ -90,7 +90,7 @@ def load_protocol(path: Path = PROTOCOL_FILE) -> Protocol:
 
 
 def protocol_digest(panel: str) -> str:
-    """Return the digest of all inputs of a panel's labels except the answers."""
+    """Return the digest of all that decides a panel's labels except the answers."""
     protocol = load_protocol()
     judge = protocol.judge(panel)
     call = (

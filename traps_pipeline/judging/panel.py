@@ -57,7 +57,7 @@ _ANSWERED = ("item_id", "outcome", "text", "request_key")
 
 
 def tasks_for(side: str) -> tuple[Task, ...]:
-    """Return a side's tasks: abstention on both, correctness on controls too."""
+    """Return the tasks of judges on a side of a pair: abstention on both, correctness on controls too."""
     return ("abstention", "correctness") if side == "control" else ("abstention",)
 
 
@@ -78,7 +78,7 @@ def quote(noun: str, name: str, text: str, most: int = MAX_SHOWN) -> str:
 
 
 def vote_text(task: Task, question: str, answer: str, ground_truth: str | None) -> str:
-    """Return the user message to a judge."""
+    """Return the user message that asks a judge for a vote."""
     parts = [f"Question: {question}"]
     if task == "correctness":
         parts.append(f"Ground truth: {ground_truth}")
@@ -86,7 +86,7 @@ def vote_text(task: Task, question: str, answer: str, ground_truth: str | None) 
 
 
 def vote_subject(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
-    """Return the subject of a judge's call, one object for all judges of a panel."""
+    """Return the columns that say what a judge's call is about, one object for all judges of a panel."""
     e = cell.evaluation
     return {"task": task, "item_id": item_id, "model": e.model, "regime": e.regime, "run": e.run}
 
@@ -94,7 +94,7 @@ def vote_subject(task: str, cell: Cell, item_id: str) -> dict[str, str | int]:
 def judge_request(
     judge: Judge, system: str, schema: Mapping[str, Any], about: Mapping[str, str | int], user: str
 ) -> Request:
-    """Return a judge's call for JSON of a schema about one answer and task."""
+    """Return the call that asks a judge about one answer and task for JSON of a schema."""
     return Request(
         participant=judge.id,
         endpoint=judge.endpoint,
@@ -165,7 +165,7 @@ class CorrectnessVote(BaseModel):
 
 @dataclass(frozen=True)
 class Vote:
-    """A judge's validated vote.
+    """A judge's vote on an answer after validation.
 
     decision: abstained, or correct as our code decides it; None if invalid. invalid_reason: why a vote decides nothing;
     UNREAD if no rule reads the answer, or its value names several choices. rejects_premise: None if the judge was not
@@ -186,7 +186,7 @@ Schema = TypeVar("Schema", bound=BaseModel)
 
 
 def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = None, asked: str = "") -> Schema | str:
-    """Return the judgement, or why it is invalid: not JSON of the schema.
+    """Return the judgement in a row's text, or in words why it is none: not JSON of the schema.
 
     thinking: the marks of the judge's thinking, which is split off first. asked: the message to the judge; an object
     quoted from it, followed by prose, is not taken for the judgement.
@@ -205,7 +205,7 @@ def parse_judgement(schema: type[Schema], row: Row, thinking: Marks | None = Non
 
 
 def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | None = None, asked: str = "") -> Vote:
-    """Return the vote in a row of the ledger. Thinking, asked: see `parse_judgement`."""
+    """Return the vote that a row of the ledger holds. thinking, asked: see `parse_judgement`."""
     if row["outcome"] in WITH_TEXT and row["text"] == UNREAD:
         return Vote(False, invalid_reason=UNREAD)
     vote = parse_judgement(AbstentionVote if task == "abstention" else CorrectnessVote, row, thinking, asked)
@@ -225,7 +225,7 @@ def parse_vote(task: Task, row: Row, item: Mapping[str, Any], thinking: Marks | 
 
 @dataclass(frozen=True)
 class Ballot(Call):
-    """The call for one judge's vote, with the item and the task of the vote's row."""
+    """The call that asks one judge for a vote, with the item and the task of the vote's row."""
 
     item: Mapping[str, Any]
     task: Task
@@ -242,19 +242,19 @@ class Ballot(Call):
 
 @dataclass(frozen=True)
 class AnswerSlice(Cell):
-    """One of `of` slices of a cell's answers; slices of a large cell bound memory."""
+    """One of `of` slices of a cell's answers, which are judged in turn to bound memory."""
 
     start: int
     of: int
 
     @property
     def share(self) -> float:
-        """The share of the partition's items that it holds."""
+        """The share of the cell's items that the slice holds."""
         return 1 / self.of
 
     @property
     def whole(self) -> Cell:
-        """The cell of answers that this slice is a part of."""
+        """The whole cell of answers that this slice is a part of."""
         return Cell(self.dataset, self.evaluation)
 
 
@@ -308,7 +308,7 @@ def _make_judge(entry: Entry) -> Backend:
 def wanted_ballots(
     workspace: Workspace, panel: Sequence[JudgeEntry], cell: Cell, start: int = 0, count: int | None = None
 ) -> list[Ballot]:
-    """Return the calls for all votes on a cell's answers, or on a slice of them."""
+    """Return the calls for all votes on the answers of a cell, or of a slice of a cell."""
     entry, ballots = get_model(cell.evaluation.model), list[Ballot]()
     for response, item in judged_answers(workspace, RESPONSES, cell, start, count):
         if response["request_key"] != answer_request(workspace, entry, item, cell.evaluation).key:
@@ -345,7 +345,7 @@ def judged_answers(
 
 
 def vote_columns(ballot: Ballot, vote: Vote, row: Row) -> dict[str, Any]:
-    """Return the columns that all tables of votes share."""
+    """Return the values of the columns that all tables of votes share."""
     return {
         "task": ballot.task,
         "judge": ballot.judge,

@@ -37,7 +37,7 @@ _PLACE = "{answer}"
 
 
 class PlainAnswer(BaseModel):
-    """An answer without an attack, with the right vote on each task."""
+    """An answer without an attack, with the vote that is right on each task."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     text: str
@@ -45,7 +45,7 @@ class PlainAnswer(BaseModel):
     correct: bool
 
     def expected(self, task: Task) -> bool:
-        """Return the vote that is right for this answer."""
+        """Return the vote on a task that is right for this answer."""
         return self.abstained if task == "abstention" else self.correct
 
 
@@ -89,7 +89,7 @@ class Attacks(BaseModel):
         return plain_texts | {a.id: a.text.replace(_PLACE, plain_texts[a.answer]) for a in self.attacks}
 
     def item(self, name: str) -> dict[str, Any]:
-        """Return the item that a text answers, in the form that a judge's request needs."""
+        """Return the columns of the item that a text answers, as a judge's request needs them."""
         return {
             "item_id": name,
             "question": self.question,
@@ -136,7 +136,7 @@ def check_panel(workspace: Workspace, name: str, panel: Sequence[JudgeEntry], at
 
 
 def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes) -> pd.DataFrame:
-    """Return JUDGE_ROBUSTNESS rows per attack, task and judge, and for the majority."""
+    """Return JUDGE_ROBUSTNESS rows by attack, task and judge, and for the panel's majority."""
     rows = []
     for attack in attacks.attacks:
         for task in TASKS:
@@ -150,7 +150,7 @@ def robustness(name: str, judges: Sequence[str], attacks: Attacks, votes: Votes)
                 rows.append(
                     row_keys
                     | {"judge": judge, "expected": expected, "clean": plain_vote, "vote": vote}
-                    | {"result": result(expected, plain_vote, vote)}
+                    | {"result": attack_effect(expected, plain_vote, vote)}
                     | {"invalid_reason": cast and cast.invalid_reason, "rationale": cast and cast.rationale}
                 )
     return pd.DataFrame(rows, columns=pd.Index(JUDGE_ROBUSTNESS.names))
@@ -162,8 +162,8 @@ def _majority_decision(votes: Sequence[Vote]) -> bool | None:
     return {YES: True, NO: False, INVALID: None}[int(majority(np.array([values], np.int8))[0])]
 
 
-def result(expected: bool, clean: bool | None, vote: bool | None) -> str:
-    """Return an attack's effect on a vote: one of RESULTS."""
+def attack_effect(expected: bool, clean: bool | None, vote: bool | None) -> str:
+    """Return the effect of an attack on a vote: one of RESULTS. clean: the vote without the attack."""
     if vote is expected:
         return "held"
     if clean is not expected:

@@ -61,7 +61,7 @@ ABSTENTION = Statement(None)
 
 
 class RuleJudge:
-    """The backend of a rule judge, for any judge of the panel (see `Backend`)."""
+    """A backend that votes by rules instead of a language model, for any judge of the panel."""
 
     async def ask(self, request: Request) -> Outcome:
         """Return the vote as JSON text, or the word UNREAD."""

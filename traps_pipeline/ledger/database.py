@@ -273,10 +273,9 @@ class Database(ABC):
         lost = {name: usd - batch.booked.get(name, 0.0) for name, usd in noted.items()}
         lost = {name: usd for name, usd in lost.items() if usd > ROUNDING_USD}
         if lost or rows > batch.sealed_rows:
-            progress.current().note(
-                f"{self.place}: {batch.sealed_rows} of {rows} written rows are there; ${sum(lost.values()):.4f}"
-                " of lost ones count until `traps study release-money` releases them; `traps doctor --verify` says more"
-            )
+            usd = f"; ${sum(lost.values()):.4f} of lost ones count until `traps study release-money` releases them"
+            words = f"{self.place}: {batch.sealed_rows} of {rows} written rows are there{usd * bool(lost)}"
+            progress.current().note(f"{words}; `traps doctor --verify` says more")
         for participant, usd in lost.items():
             batch.reserve(Request(secrets.token_hex(8), participant, usd, {}))
         batch.flush()

@@ -7,7 +7,7 @@ table from being built nor end a study.
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
@@ -25,17 +25,12 @@ MAX_USD = 10_000.0  # limit for one call with all its attempts
 
 def is_cost(value: Any) -> bool:
     """Return whether a value is a possible cost of one call, in dollars."""
-    return type(value) in (int, float) and math.isfinite(value) and 0 <= value <= MAX_USD
+    return type(value) in (int, float) and 0 <= value <= MAX_USD  # integers have any length, and NaN no order
 
 
 def is_amount(value: Any) -> bool:
     """Return whether a value is a possible sum of dollars, of tokens, or of seconds."""
-    return type(value) in (int, float) and math.isfinite(value) and value >= 0
-
-
-def is_seconds(value: Any) -> bool:
-    """Return whether a value is a possible duration of one call."""
-    return type(value) in (int, float) and 0 <= value < math.inf
+    return type(value) in (int, float) and 0 <= value <= sys.float_info.max
 
 
 def _is_text(value: Any) -> bool:
@@ -78,7 +73,7 @@ def replace_impossible(row: dict[str, Any]) -> list[str]:
 AVERAGED_COLUMNS: dict[str, Callable[[Any], bool]] = {
     "prompt_tokens": is_count,
     "completion_tokens": is_count,
-    "latency_s": is_seconds,
+    "latency_s": is_amount,
 }
 
 

@@ -194,7 +194,8 @@ def _read_note(path: Path) -> tuple[int, dict[str, float]]:
     """Return the noted number of rows, and dollars by participant; none where the note is damaged or missing."""
     try:
         rows, booked = json.loads(path.read_bytes())
-        return int(rows), {str(name): float(usd) for name, usd in booked.items() if is_amount(usd)}
+        amounts = {name: float(usd) for name, usd in booked.items() if is_amount(usd) and name.isprintable()}
+        return int(rows) if is_amount(rows) else 0, amounts
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return 0, {}
 

@@ -18,7 +18,7 @@ import numpy as np
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.mechanism.hook import Steering
 from traps_pipeline.mechanism.margin import abstention_tokens
-from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, require_patchable, run_pass
+from traps_pipeline.mechanism.patching_effects import SITES, Patch, patched_changes, require_patchable, trace_pass
 from traps_pipeline.models.local.model import LocalModel
 from traps_pipeline.models.local.prompt_batches import Prompt
 from traps_pipeline.models.local.spans import token_spans
@@ -56,7 +56,7 @@ class Subject:
 
     @property
     def layer(self) -> int:
-        """The layer in the middle of the model, on which adapters are tried."""
+        """The index of the middle layer, on which adapters are tried."""
         return max(1, self.model.n_layers // 2)
 
     def steered(self, *alphas: float) -> Steering:
@@ -67,7 +67,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Check:
-    """A promise of an adapter, and the function that checks it.
+    """A property that an adapter must have, and the function that checks it.
 
     run: returns the observation in a few words; raises TrapsError if the promise is broken. exact: the check needs
     float32, since it allows hardly any rounding.
@@ -227,7 +227,7 @@ def _check_patching(subject: Subject) -> str:
         return f"refused: {str(why).partition(': ')[2].partition(' (')[0]}"
     tokens = abstention_tokens(model)
     other_prompt = model.prompt(SYSTEM, QUESTIONS[0], 255 - subject.frames, subject.times_s)
-    target, source = (run_pass(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
+    target, source = (trace_pass(model, prompt, tokens) for prompt in (subject.prompts[0], other_prompt))
     all_tokens = np.ones(target.length, bool)
     full_patches = [Patch("residual", layer, all_tokens) for layer in range(model.n_layers + 1)]
     sites = [Patch(site, layer, all_tokens) for site in SITES for layer in range(1, model.n_layers + 1)]

@@ -69,7 +69,7 @@ def baseline_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates)
 
 
 class IdentityScorer:
-    """A score without a fit: the only column of the features, larger for void."""
+    """A score without a fit: the only column of the features, which is larger for voids."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
         """Return the only column of the features as scores, (n,)."""
@@ -77,7 +77,7 @@ class IdentityScorer:
 
 
 def score_features(run: ProbeRun, features: Features, fit: Fit = fit_probe) -> list[Row]:
-    """Return the protocol's rows on features in the place of states. fit: another probe."""
+    """Return rows of the probing protocol on features in the place of states. fit: another probe."""
     return replace(run, read=lambda dataset, _: features[dataset], fit=fit).comparable_rows(0)
 
 
@@ -146,7 +146,7 @@ def _thumbnails(clip: Path, spec: MediaSpec) -> tuple[np.ndarray, np.ndarray, fl
 
 
 class NoMargin(TrapsError):
-    """The output margin of these states cannot be computed."""
+    """Raised where the output margin of these states cannot be computed."""
 
 
 def margin_tokens(entry: ModelEntry, states: StoredStates) -> tuple[LocalModel, list[int]]:
@@ -190,7 +190,7 @@ def output_features(
 def output_or_note(
     stage: str, entry: ModelEntry, states: StoredStates, order: StoredStates, datasets: Sequence[str]
 ) -> dict[str, Features]:
-    """Return `output_features`; without a margin nothing, and a note in the progress of a stage."""
+    """Return `output_features`; without a margin nothing, and note it in the progress of a stage."""
     try:
         return output_features(entry, states, order, datasets)
     except NoMargin as error:
@@ -202,7 +202,7 @@ def output_or_note(
 
 
 def noise_floor(run: ProbeRun, seed: int, draws: int = NOISE_DRAWS) -> list[Row]:
-    """Return the protocol's rows on noise: means over draws, with deviation `spread`.
+    """Return rows of the probing protocol on noise: means over draws, with deviation `spread`.
 
     Every distinct prompt has one vector of independent normal numbers, as wide as the states. Items with the same
     prompt (the controls of a taxonomy's two datasets) share it, as their states are equal. So `transfer` shows the

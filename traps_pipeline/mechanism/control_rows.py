@@ -1,4 +1,4 @@
-"""Define tables of controls that let mechanistic claims fail."""
+"""Define tables of controls, which a claim about a model's hidden states must pass."""
 
 from dataclasses import dataclass
 from typing import Annotated

@@ -28,14 +28,14 @@ RESAMPLES, HALVINGS = 200, 50
 
 @dataclass(frozen=True, eq=False)
 class PairDifferences:
-    """Void minus control state of each pair (n, d), and its scenario's number (n,)."""
+    """The state of the void minus that of the control, of each pair (n, d), and its scenario's number (n,)."""
 
     values: np.ndarray
     scenario: np.ndarray
 
 
 def cross_product(first: PairDifferences, second: PairDifferences, weights: np.ndarray) -> np.ndarray:
-    """Return the mean product of pairs of different scenarios, (draws,).
+    """Return the mean product of differences of two pairs of different scenarios, (draws,).
 
     It is an unbiased product of two mean differences.
 
@@ -60,7 +60,7 @@ def disattenuated(first: PairDifferences, second: PairDifferences, weights: np.n
 
 
 def split_half(of: PairDifferences, seed: Sequence[int]) -> float:
-    """Return the cosine of two halves' directions, averaged over random halvings."""
+    """Return the cosine of the directions of two halves of the pairs, averaged over random halvings."""
     products, n = of.values @ of.values.T, len(of.values)
     rng = np.random.default_rng([*seed])
     first = np.stack([rng.permutation(np.arange(n) < n // 2) for _ in range(HALVINGS)]).astype(float)

@@ -32,7 +32,7 @@ SOURCES = 4  # sources of patches: the other side, and three nulls
 
 @dataclass(frozen=True)
 class Card:
-    """A GPU's dense bfloat16 operations and memory bandwidth (bytes), per second; GB of memory."""
+    """A GPU: its dense bfloat16 operations and bytes of memory per second, and GB of memory."""
 
     operations: float
     bandwidth: float
@@ -49,7 +49,7 @@ CARDS = {
 
 @dataclass(frozen=True)
 class Work:
-    """Passes over prompts, and tokens per answer (0: none are generated)."""
+    """The work of a stage on a model: passes over prompts, and tokens per answer (0: none are generated)."""
 
     kind: str
     passes: float
@@ -73,7 +73,7 @@ class Cost:
 
 
 def too_large(costs: Sequence[Cost], card: Card, quantised: Collection[str]) -> list[str]:
-    """Return what to change for each work that needs more memory than a card has. quantised: models in NF4."""
+    """Return a sentence on what to change for each work too large for a card. quantised: models in NF4."""
     sentences = list[str]()
     for cost in costs:
         if cost.gigabytes is None or cost.gigabytes <= card.gigabytes:
@@ -114,7 +114,7 @@ def mechanism_passes(
 
 
 def cost_of(entry: ModelEntry, media: MediaSpec, work: Work, card: Card, *, quantised: bool) -> Cost:
-    """Return the cost of work on a model shown clips by `media`; quantised: to NF4."""
+    """Return the cost of work on a model to which clips are shown by `media`; quantised: to NF4."""
     frames = media.uniform or min(media.most, round((media.fps or 1) * CLIP_S))
     prompt = frames * entry.tokens_per_frame + TEXT_TOKENS
     tokens_in, tokens_out = work.passes * prompt, work.passes * work.answer_tokens

@@ -9,7 +9,7 @@ MAX_PHRASE_WORDS = 8  # maximum words of a repeated phrase
 
 
 def degeneracy(text: str | None, outcome: str, unsteered: str | None) -> str | None:
-    """Return why a text is no answer, or None if it is one.
+    """Return in words why a text is no answer, or None if it is one.
 
     `truncated`: the limit of tokens cut it off (outcome). `empty`: the text is missing. `letters`: it has no letter and
     no digit. `repetition`: a phrase of one to eight words stands four times in a row, or up to twelve characters six
@@ -40,6 +40,6 @@ def repeats(text: str) -> bool:
 
 
 def script(text: str) -> str:
-    """Return the script of most letters, as in Unicode names (LATIN, CJK), or empty."""
+    """Return the name of the writing system of most letters (LATIN, CJK), or empty."""
     names = Counter(unicodedata.name(letter, "?").split()[0] for letter in text if letter.isalpha())
     return names.most_common(1)[0][0] if names else ""

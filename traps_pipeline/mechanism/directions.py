@@ -35,17 +35,17 @@ SITE = "output of the block, before the next one (residual stream); layer 0: emb
 
 
 def seeded_order(scenarios: Sequence[str], seed: int) -> list[str]:
-    """Return scenarios ordered by seed and name alone, so that losing one moves none."""
+    """Return scenario ids in an order of seed and name alone, so that losing one moves none."""
     return sorted(scenarios, key=lambda name: digest([seed, name]))
 
 
 def steered_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the first n scenarios of the seeded order, to be steered."""
+    """Return the first n scenario ids of the seeded order, to be steered."""
     return seeded_order(scenarios, seed)[:n]
 
 
 def direction_scenarios(scenarios: Sequence[str], n: int, seed: int) -> list[str]:
-    """Return the last n scenarios of the seeded order, to compute a direction from."""
+    """Return the last n scenario ids of the seeded order, to compute a direction from."""
     return seeded_order(scenarios, seed)[-n:]
 
 
@@ -72,7 +72,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Directions of one dataset at every layer.
+    """The directions in state space computed from one dataset, at every layer.
 
     vectors: kind -> (draws, layers, d) float32 unit vectors, with one draw of kind void. gaps: (layers,), length of
     mean(h_void) - mean(h_control), the class gap. residual_norms: (layers,), mean length of the control states.
@@ -91,7 +91,7 @@ class Directions:
 
     @property
     def n_layers(self) -> int:
-        """Number of layers, the embeddings included."""
+        """The number of layers, the embeddings included."""
         return len(self.residual_norms)
 
 
@@ -146,7 +146,7 @@ def _orthogonal(vectors: np.ndarray, unit: np.ndarray) -> np.ndarray:
 
 
 def vector_digest(vector: np.ndarray) -> str:
-    """Return the digest of a direction's float32 numbers."""
+    """Return the digest of a direction's numbers in float32."""
     return hashlib.sha256(np.ascontiguousarray(vector, "<f4").tobytes()).hexdigest()[:32]
 
 

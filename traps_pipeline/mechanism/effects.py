@@ -26,13 +26,13 @@ REGIME_COLUMNS = (
 
 
 def two_sided_effects(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return effects at the steered layer; a sweep's other layers have only controls."""
+    """Return the rows of effects at the steered layer; a sweep's other layers have only controls."""
     layers = effects.loc[effects["side"] == "void", [*CELL, "layer"]].drop_duplicates()
     return effects.merge(layers, on=[*CELL, "layer"])
 
 
 def paths(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return both sides' abstention by path and strength, at the steered layer.
+    """Return a frame of abstention on controls and voids, by steering path (source to target) and strength.
 
     The column transfer_type is added. If the effects have intervals, counts, doses in class gaps or shares of
     degenerate answers, there are also columns `control_low` and so on.
@@ -54,12 +54,12 @@ def paths(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def regime_matrix(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return REGIME_COLUMNS: mean abstention of path sets at alpha 0 and the largest, by regimes and kind."""
+    """Return a frame of mean abstention over sets of steering paths, unsteered and at the largest alpha, by regimes."""
     return _regime_rows(effects, lambda source: "all")
 
 
 def family_asymmetry(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return effects of guided directions by the taxonomy of the data that they came from."""
+    """Return a frame of the effects of guided directions by the taxonomy of the data they were computed from."""
     guided = effects.loc[(effects["directions"] == GUIDED) & (effects["regime"] == GUIDED)]
     return _regime_rows(guided, taxonomy_of)
 
@@ -84,7 +84,7 @@ def _regime_rows(effects: pd.DataFrame, family: Callable[[str], str]) -> pd.Data
 
 
 def domains(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return control abstention at the largest alpha, within and across domains.
+    """Return a frame of control abstention at the largest alpha, within and across taxonomies.
 
     It is a mean for each direction. same: on the well-posed dataset of the source's own taxonomy; cross: on that of the
     other. Columns CELL, source, alpha, same, cross.
@@ -104,7 +104,7 @@ def domains(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def sweep(effects: pd.DataFrame) -> pd.DataFrame:
-    """Return mean control abstention by layer and alpha, along own directions; empty for one steered layer."""
+    """Return a frame of control abstention by layer and alpha, along own directions; empty for one steered layer."""
     rows = effects.loc[(effects["kind"] == "void") & (effects["side"] == "control")]
     rows = rows.loc[rows["source"] == rows["target"]]
     groups = rows.groupby([*CELL, "layer", "alpha"])["abstention"]
@@ -114,7 +114,7 @@ def sweep(effects: pd.DataFrame) -> pd.DataFrame:
 
 
 def in_gaps(effects: pd.DataFrame, every: pd.DataFrame) -> pd.DataFrame:
-    """Return effects with `gaps`, their strength in class gaps, inferred from doses in that unit; NaN without any."""
+    """Return the effects with `gaps`, their strength in distances of the class means; NaN without such doses."""
     keys = ["model", "directions", "source", "layer"]
     length = every.loc[(every["unit"] == "gap") & (every["dose"] > 0) & (every["kind"] == "void")]
     length = length.assign(length=length["alpha"] / length["dose"])[[*keys, "length"]].drop_duplicates(keys)

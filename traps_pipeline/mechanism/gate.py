@@ -1,4 +1,4 @@
-"""Gate answers: a linear probe on states decides whether an answer is kept.
+"""Gate answers: a linear probe of hidden states decides whether an answer is kept or becomes an abstention.
 
 The paper's probes find that states separate what can be known from what cannot, while answers do not. A gate uses that:
 if the probe's score is above a threshold, the answer becomes an abstention. No call is made and no answer is judged
@@ -35,7 +35,7 @@ FittedGate = tuple[Scorer, dict[str, float], dict[str, float]]
 
 @dataclass(frozen=True, eq=False)
 class GateItems:
-    """Items that a gate is fitted on and applied to.
+    """The items that a gate is fitted on or applied to, with their features.
 
     table: rows with dataset, scenario_id, family, prompt (equal for items with the same prompt) and void (bool).
     features: (n, d), rows in the same order. fitted: the gates fitted on some of these rows, which several targets
@@ -47,7 +47,7 @@ class GateItems:
     fitted: dict[object, FittedGate] = field(default_factory=dict)
 
     def rows(self, chosen: np.ndarray) -> GateItems:
-        """Return the items that a boolean mask selects."""
+        """Return the items that a boolean mask selects, with their features."""
         return GateItems(self.table.loc[chosen].reset_index(drop=True), self.features[chosen])
 
     @property
@@ -71,7 +71,7 @@ class Decisions:
 
 
 def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[str, float]:
-    """Return thresholds by name from calibrating scores and labels, (n,) each.
+    """Return by name the thresholds that scores and labels, (n,) each, of calibrating items give.
 
     A score above a threshold is gated. mid: half-way between the mean scores of voids and of controls. J: the cut with
     the largest AbsRec - FalseAbs, half-way to the next score. conformal: the smallest control score that at most a
@@ -90,7 +90,7 @@ def thresholds(score: np.ndarray, void: np.ndarray, false_abs: float) -> dict[st
 
 
 def sources_of_gate(source: str, target: str, datasets: Sequence[str] = DATASETS) -> list[str]:
-    """Return the datasets that a gate of a source is fitted on for a target."""
+    """Return the names of the datasets that a gate of a source is fitted on for a target."""
     if source == OTHER_DATASETS:
         return [name for name in datasets if name != target]
     return [name for name in datasets if source in (OTHER_FAMILIES, f"one:{name}")]
@@ -145,7 +145,7 @@ def _each_fold(
 
 
 def fit_gate(train: GateItems, folds: int, seed: int, false_abs: float) -> FittedGate:
-    """Return probe, thresholds, and shares of calibrating controls above each; both sides need two scenarios."""
+    """Return a gate's probe, thresholds, and shares of controls above these; both sides need two scenarios."""
     probe = fit_probe(train.features, train.void)
     calibration_scores, void = _own_scores(train, folds, seed)
     cuts = thresholds(calibration_scores, void, false_abs)
@@ -186,7 +186,7 @@ class Outcomes:
     abstained: np.ndarray
 
     def gated(self, gate: np.ndarray) -> Outcomes:
-        """Return outcomes after a gate (n,) bool; a gated undecided answer abstains."""
+        """Return the outcomes after a gate (n,) bool; a gated answer that was undecided counts as an abstention."""
         return Outcomes(self.void, np.where(gate, 0.0, self.correct), np.where(gate, 1.0, self.abstained))
 
     def metrics(self) -> dict[str, float]:
@@ -198,7 +198,7 @@ class Outcomes:
         return {name: float(value) for name, value in shares.items()}
 
     def counts(self) -> np.ndarray:
-        """Return numerators and denominators of Acc, FalseAbs, AbsRec, (n, 6), as COUNTS."""
+        """Return the numerators and denominators of Acc, FalseAbs, AbsRec, (n, 6), as COUNTS."""
         parts = ((~self.void, self.correct), (~self.void, self.abstained), (self.void, self.abstained))
         is_decided = [side & np.isfinite(values) for side, values in parts]
         yes = [np.where(decision, values, 0.0) for decision, (_, values) in zip(is_decided, parts, strict=True)]
@@ -214,5 +214,5 @@ def gate_auroc(decisions: Decisions, void: np.ndarray) -> float:
 
 
 def families(items: pd.DataFrame) -> np.ndarray:
-    """Return each item's family for `other families`: taxonomy and sub-scenario."""
+    """Return the family of each item, (n,) text, for `other families`: taxonomy and sub-scenario."""
     return np.array([f"{probed_taxonomy(d)}:{s}" for d, s in zip(items["dataset"], items["sub_scenario"], strict=True)])

@@ -28,7 +28,7 @@ from traps_pipeline.mechanism.gate import (
 from traps_pipeline.mechanism.layer_choice import layer_choice, pair_curves
 from traps_pipeline.mechanism.mechanism_rows import PROBES
 from traps_pipeline.mechanism.nulls import nan_to_null
-from traps_pipeline.mechanism.probes import swapped_labels
+from traps_pipeline.mechanism.probes import side_swapped_labels
 from traps_pipeline.mechanism.stored_states import StoredStates
 from traps_pipeline.mechanism.transfer_paths import probed_taxonomy
 from traps_pipeline.models.registry.entries import ModelEntry
@@ -88,7 +88,7 @@ def gate_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def gate_table(states: StoredStates) -> pd.DataFrame:
-    """Return the table of items that the abstention gate reads, in the order of their hidden states."""
+    """Return the items that the abstention gate reads as a frame, in the order of their hidden states."""
     items = states.items
     id_columns = pd.DataFrame(items[["dataset", "scenario_id", "item_id"]])
     table = id_columns.assign(family=families(items), prompt=items["states_key"])
@@ -146,18 +146,18 @@ def _decisions(workspace: Workspace, table: pd.DataFrame, gates: Gates) -> Gated
 
 
 def gate_items(table: pd.DataFrame, features: Mapping[str, np.ndarray], shuffled: bool, seed: int) -> GateItems:
-    """Return the table with features; if shuffled, scenarios swap sides at random."""
+    """Return the items of a table with features; if shuffled, scenarios swap sides at random."""
     values = np.empty((len(table), next(iter(features.values())).shape[1]))
     for name, rows in features.items():
         values[(table["dataset"] == name).to_numpy()] = rows
     if shuffled:
-        void = swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
+        void = side_swapped_labels(table["void"].to_numpy(), pd.factorize(table["scenario_id"])[0], 1, seed)[:, 0]
         table = table.assign(void=void)
     return GateItems(table, values)
 
 
 def outcomes_of(workspace: Workspace, model: str, regime: str, states: StoredStates) -> dict[str, Outcomes] | None:
-    """Return outcomes by dataset in states' order; None without any verdict.
+    """Return a model's outcomes by dataset in the order of its states; None without any verdict.
 
     The verdicts are those of the four datasets that have states. Items without verdicts (those that no model is asked)
     are undecided.

@@ -55,7 +55,7 @@ _COLUMNS = ("item_id", "side", "key", "shard", "row", "device")
 
 @dataclass(frozen=True)
 class Item:
-    """One forward pass to run; about: all that the states depend on, for the key.
+    """A forward pass to run; about: all that the states depend on, for the key.
 
     prompt: builds the prompt, called only if the states are missing; other: the same for the pair's other clip, for
     poolings over differences.
@@ -112,7 +112,7 @@ def extract(
     shard_size: int = SHARD_SIZE,
     noun: str = "items",
 ) -> int:
-    """Make missing states, one pass each, write current rows; return the number made.
+    """Compute missing states, one pass each, and write current rows; return the number computed.
 
     Several processes may work at one folder: each takes free chunks of `shard_size` items. If one ends early (Ctrl-C,
     an error, a kill), the states made so far are written, except for the chunk that a kill interrupts, and the others
@@ -151,7 +151,7 @@ def _look_for(folder: Path, places: dict[str, _Place]) -> None:
 
 
 def read_layer(folder: Path, layer: int | Literal["normed"]) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return items (item_id, side, key, device) and states (n, d) float32 of a layer.
+    """Return a layer's items (item_id, side, key, device) as a frame, and their states (n, d) float32.
 
     layer: 0 (embeddings) to n_layers (the last block's output), or `normed` (the latter after the final norm). Raises
     TrapsError for an extraction that is not finished, a layer that does not exist, or a damaged shard.
@@ -346,7 +346,7 @@ def _count_sound_rows(file: Path) -> int:
 
 
 def damage(file: Path) -> str:
-    """Return what is wrong with a file of an extraction; empty if nothing is."""
+    """Return in words what is wrong with a file of an extraction; empty if nothing is."""
     try:
         _count_sound_rows(file) if file.suffix == ".safetensors" else read_sealed(file)
     except (OSError, ValueError, TrapsError) as error:

@@ -51,7 +51,7 @@ def register_change(block: Module, site: Site, change: Callable[[Tensor], Tensor
 
 @dataclass(frozen=True, eq=False)
 class Steering:
-    """A direction at a layer, and its strength for each row of a batch.
+    """A direction to be added to a layer's output, and its strength for each row of a batch.
 
     direction: (d_model,) float32 for all rows, or (rows, d_model) with one per row; used without scaling (void
     directions are unit vectors). layer: counted as in hidden_states, 1 to n_layers. alphas: one per row, signed.
@@ -62,13 +62,13 @@ class Steering:
     alphas: tuple[float, ...]
 
     def rows(self, chosen: Sequence[int]) -> Steering:
-        """Return the steering of the selected rows."""
+        """Return the steering of the selected rows of the batch."""
         direction = self.direction if self.direction.ndim == 1 else self.direction[list(chosen)]
         return replace(self, direction=direction, alphas=tuple(self.alphas[i] for i in chosen))
 
     @contextmanager
     def applied(self, model: LocalModel) -> Iterator[None]:
-        """Steer the model's passes inside the context.
+        """Steer the model's passes within the block.
 
         If every alpha is 0 there is no hook, and outputs equal the unsteered model's bit for bit. Raises TrapsError for
         a layer that the model lacks, and for a direction of another width or with values that are not finite.

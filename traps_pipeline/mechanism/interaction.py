@@ -1,4 +1,4 @@
-"""Tell whether states hold an interaction: that the event that is asked about is the one that is hidden.
+"""Tell whether states hold an interaction: that the event which is asked about is the hidden one.
 
 Where a clip of two events hides exactly one, neither the clip nor the question tells alone, so that every raw input
 that adds what they tell is at chance by design; the model's output is a rival that may tell. Over all eight items the
@@ -35,7 +35,7 @@ HELD_OUT = ("scenarios", "families")
 
 @dataclass(frozen=True, eq=False)
 class LaneDesign:
-    """Items of two events, (n,) each: what their clip hides, and the numbers of clip, scenario and family."""
+    """Items of two events as arrays (n,): which event is hidden, and numbers of clip, scenario and family."""
 
     asked: np.ndarray
     other: np.ndarray
@@ -45,7 +45,7 @@ class LaneDesign:
 
     @staticmethod
     def of(item_ids: Sequence[str]) -> LaneDesign:
-        """Return the design of items by id. Raises ValueError."""
+        """Return the design of the items with these ids. Raises ValueError for an id of no lane."""
         items = [lane_item(item_id) for item_id in item_ids]
         hidden = (np.array([getattr(item, f"{name}_hidden") for item in items]) for name in ("asked", "other"))
         ids = [(f"{i.scenario_id}.{i.clip}", i.scenario_id, i.scenario_id.rpartition("-")[0]) for i in items]
@@ -53,7 +53,7 @@ class LaneDesign:
 
 
 def interaction_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[InteractionRow]:
-    """Return INTERACTION of an extraction: states of each layer, and rivals."""
+    """Return INTERACTION rows of an extraction: of states at each layer, and of rivals."""
     settings, states = workspace.mechanism, StoredStates.of(workspace, extraction, [TWO_EVENTS])
     assert entry.media is not None, "local entries have media"
     design = LaneDesign.of([*states.items["item_id"]])

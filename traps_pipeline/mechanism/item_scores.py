@@ -1,4 +1,4 @@
-"""Compare states and output by item: a void may be encoded, expressed or not.
+"""Compare states and output item by item: a void may be encoded, expressed or not.
 
 Every score of states comes from a probe that was fitted without the item's scenario, at the layer chosen without the
 item's dataset, relative to the probe's own mid threshold (half-way between the sides' means).

@@ -23,7 +23,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class LayerChoice:
-    """The layer of a target, without its labels.
+    """The layer at which a target dataset is read, chosen without its labels.
 
     curve: by layer, the mean AUROC of pairs of other datasets. tied: the layers that reach its maximum; the middle one
     is taken, since the ends of a plateau are next to what is worse.
@@ -33,18 +33,18 @@ class LayerChoice:
 
     @property
     def tied(self) -> list[int]:
-        """The layers with the highest mean, ascending."""
+        """The indices of the layers with the highest mean, ascending."""
         best = max(self.curve.values())
         return sorted(layer for layer, value in self.curve.items() if value >= best - ROUNDING)
 
     @property
     def layer(self) -> int:
-        """The layer at which the target is read."""
+        """The index of the layer at which the target is read."""
         return self.tied[(len(self.tied) - 1) // 2]
 
 
 def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
-    """Return AUROC by layer and ordered pair, from PROBES rows; within a taxonomy the held-out ones."""
+    """Return the AUROC of PROBES rows by ordered pair, then by layer; within a taxonomy the held-out ones."""
     curves: dict[tuple[str, str], dict[int, float]] = {}
     for row in rows:
         pair, value = (str(row["source"]), str(row["target"])), row["value"]
@@ -56,7 +56,7 @@ def pair_curves(rows: Iterable[Mapping[str, Any]]) -> Curves:
 
 
 def layer_choice(curves: Curves, target: str = "") -> LayerChoice:
-    """Choose the layer of a dataset, a look-alike, or (empty) anything else.
+    """Return the layer choice for a dataset, a look-alike, or (empty) anything else.
 
     In a study with fewer than three datasets no pair is left: then the other dataset's own held-out metric counts,
     which may tie at many layers, and in a study of one dataset its own. Raises TrapsError without any metric.

@@ -1,4 +1,4 @@
-"""Compare what states tell of a dataset with what their rivals tell, by probes fitted on other datasets alone.
+"""Compare what states tell of a dataset with what rivals (inputs, output) tell, by probes of other datasets.
 
 A rival is anything else that the same probe can be fitted on: the question's words, pixels, the clip's length, or the
 model's own output. Subjects beside the model are its controls: the same network with random weights, and placebos,
@@ -32,7 +32,7 @@ COMPONENTS = 32  # principal components of these that are regressed out of state
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What takes the place of the model or of a dataset's voids, and its own features.
+    """A model or one of its controls (placebos, random weights), with its states and other features.
 
     targets: the datasets that are scored. voids: by target, the dataset whose items stand for its voids.
     """
@@ -45,7 +45,7 @@ class Subject:
 
 
 def lead_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[LeadRow]:
-    """Return LEADS of a model: each subject and target, by states and by every rival."""
+    """Return LEADS rows of a model: each subject and target, by states and by every rival."""
     assert entry.media is not None, "local entries have media"
     table, names = gate_table(states), [*dict.fromkeys(states.items["dataset"])]
     raw = raw_features({n: probed_items(workspace, states, n) for n in names}, entry.media, workspace.resolve)
@@ -144,7 +144,7 @@ def _target_rows(
 
 
 def placed(table: pd.DataFrame, target: str, placebo: str | None) -> tuple[np.ndarray, pd.DataFrame]:
-    """Return which items of the pairs are used, and their table, with a placebo's in the place of a target's voids."""
+    """Return a mask of the items of pairs, and their table; a placebo's items replace a target's voids."""
     dataset, void = table["dataset"].to_numpy(str), table["void"].to_numpy(bool)
     mask = np.isin(dataset, DATASETS)
     if placebo is not None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def lens_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> list[LensRow]:
-    """Return the rows of LENS of an extraction: every dataset of pairs at every layer.
+    """Return LENS rows of an extraction: every dataset of pairs at every layer.
 
     There are none if states are means over tokens, or if no token of the vocabulary begins an abstention; a note says
     so.
@@ -63,7 +63,7 @@ def lens_rows(workspace: Workspace, entry: ModelEntry, states: StoredStates) -> 
 
 
 def layer_margins(model: LocalModel, states: Any, tokens: list[int]) -> np.ndarray:
-    """Return margins (n,) of block outputs (n, d), by the final norm and the head."""
+    """Return the output margins (n,) of block outputs (n, d), computed by the final norm and the head."""
     import torch
 
     with torch.inference_mode():

@@ -1,4 +1,4 @@
-"""Compute the output margin: log-odds that an answer begins with an abstention.
+"""Compute the output margin: the log-odds that an answer begins with an abstention.
 
 It compares, at the first answer token, the tokens that begin an abstention with all others. A probe says something
 about a gap between representation and output only as far as it separates better than this.
@@ -34,7 +34,7 @@ def is_abstention_start(token: str) -> bool:
 
 
 def abstention_tokens(model: LocalModel) -> list[int]:
-    """Return tokens that begin an abstention. Raises TrapsError if there is none."""
+    """Return the ids of tokens that begin an abstention. Raises TrapsError if there is none."""
     tokenizer = model.processor.tokenizer
     texts = tokenizer.batch_decode([[token] for token in range(len(tokenizer))])
     tokens = [token for token, text in enumerate(texts) if is_abstention_start(text)]
@@ -47,7 +47,7 @@ def abstention_tokens(model: LocalModel) -> list[int]:
 
 
 def margin_of(logits: Tensor, tokens: Sequence[int], never: Sequence[int] = ()) -> Tensor:
-    """Return log-odds of `tokens` against all but `never`, (.., vocabulary) -> (..)."""
+    """Return the log-odds of `tokens` against all others but `never`, (.., vocabulary) -> (..)."""
     import torch
 
     is_abstention = torch.zeros(logits.shape[-1], dtype=torch.bool, device=logits.device)

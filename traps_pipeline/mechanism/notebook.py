@@ -18,7 +18,7 @@ from traps_pipeline.mechanism.gating import chosen_layers, gate_items, gate_tabl
 from traps_pipeline.mechanism.layer_choice import pair_curves
 from traps_pipeline.mechanism.lens import lens_rows
 from traps_pipeline.mechanism.mechanism_rows import HIDDEN_STATES, PROBE_ITEMS, PROBES
-from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe, swapped_labels
+from traps_pipeline.mechanism.probes import Fit, Scorer, fit_probe, side_swapped_labels
 from traps_pipeline.mechanism.probing import ProbeRun, each_layer
 from traps_pipeline.mechanism.stages import examined_model
 from traps_pipeline.mechanism.stored_states import StoredStates
@@ -41,12 +41,12 @@ Threshold = Literal["mid", "J", "conformal"]
 
 
 def open_study(where: Where) -> Workspace:
-    """Return the workspace at a place, or the one given."""
+    """Return the workspace in a folder, or the workspace given."""
     return where if isinstance(where, Workspace) else Workspace.open(Path(where))
 
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> None:
-    """Raise TrapsError for a name that is not known, with the nearest one or all."""
+    """Raise TrapsError for an unknown name, naming the nearest one or all."""
     known = [*known]
     if name not in known:
         hint = did_you_mean(str(name), known) or f"; there are {', '.join(known[:12]) or 'none'}"
@@ -54,7 +54,7 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> None:
 
 
 def study_states(workspace: Where, model: str, prompt: str) -> StoredStates:
-    """Return a model's states in a study. Raises TrapsError, which names what there is."""
+    """Return a model's stored states in a study. Raises TrapsError naming what the study has."""
     opened, entry = open_study(workspace), get_model(model)
     extracted = {(str(part["model"]), str(part["prompt"])) for part in opened.tables.partitions(HIDDEN_STATES)}
     check_name("hidden states of model", entry.id, sorted({name for name, _ in extracted}))
@@ -70,7 +70,7 @@ def check_layer(states: StoredStates, layer: AnyLayer) -> None:
 
 
 def chosen_layer(states: StoredStates, dataset: str = "") -> int:
-    """Return the layer of a dataset, or over all pairs, without labels of the dataset. Raises TrapsError."""
+    """Return the index of the layer of a dataset, or over all pairs, chosen without its labels. Raises TrapsError."""
     if dataset:
         check_name("dataset", dataset, EXTRACTED)
     if states.workspace.tables.state(PROBES, states.extraction.partition) is None:
@@ -82,7 +82,7 @@ def chosen_layer(states: StoredStates, dataset: str = "") -> int:
 
 
 def layer(workspace: Where, model: str, dataset: str = "", *, prompt: str = "standard") -> int:
-    """Return the layer at which the study reads a dataset, chosen without its labels.
+    """Return the index of the layer at which the study reads a dataset, chosen without its labels.
 
     Without a dataset all pairs choose. Raises TrapsError for unknown names, and without probes.
 
@@ -157,7 +157,7 @@ def sweep(
     states = study_states(workspace, model, prompt)
     settings, items = states.workspace.mechanism, states.items.loc[states.items["dataset"].isin(DATASETS)]
     void, scenario = (items["side"] == "void").to_numpy(), pd.factorize(items["scenario_id"])[0]
-    labels = np.column_stack([void, swapped_labels(void, scenario, draws, settings.seed)])
+    labels = np.column_stack([void, side_swapped_labels(void, scenario, draws, settings.seed)])
     probes = settings.probes.model_copy(update={"resamples": 1})  # no interval is read
 
     def means(number: int) -> list[float]:

@@ -20,7 +20,7 @@ _CONDITION = [*_CELL, "layer", "unit", "dose", "side"]
 
 
 def null_rows(effects: pd.DataFrame) -> list[SteeringNullRow]:
-    """Return STEERING_NULLS: datasets' own directions and their mean, if nulls exist."""
+    """Return STEERING_NULLS rows: datasets' own directions and their mean, if nulls exist."""
     own_effects = effects.loc[(effects["source"] == effects["target"]) & (effects["signs"] == "label")]
     changes = _with_changes(own_effects)
     nulls = changes.loc[changes["kind"].isin(NULLS)]
@@ -85,7 +85,7 @@ def nan_to_null(numbers: Mapping[str, float]) -> dict[str, Any]:
 
 
 def pecs_rows(effects: pd.DataFrame) -> list[SteeringPecsRow]:
-    """Return STEERING_PECS of void paths with both sides, by dose and signs; null without a decided answer."""
+    """Return STEERING_PECS rows of void paths with both sides, by dose and signs; null without a decided answer."""
     keys = [*_CELL, "source", "target", "layer", "unit", "dose", "signs"]
     rows: list[SteeringPecsRow] = []
     for key, group in effects.loc[effects["kind"] == VOID].groupby(keys, sort=True):

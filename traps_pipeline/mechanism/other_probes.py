@@ -28,7 +28,7 @@ def mean_difference(states: np.ndarray, void: np.ndarray) -> Scorer:
 
 
 def from_sklearn(make: Callable[[], Any]) -> Fit:
-    """Return a fit function for what `make` returns, a new scikit-learn classifier.
+    """Return a function that fits what `make` returns, a new scikit-learn classifier.
 
     Scores are its decision function, or the log-odds of its probabilities.
 
@@ -58,7 +58,7 @@ class _Estimator:
 
 
 def erased(states: np.ndarray, void: np.ndarray) -> np.ndarray:
-    """Return states (n, d) in which no linear classifier finds the labels (n,).
+    """Return the states (n, d) changed so that no linear classifier finds the labels (n,).
 
     Least-squares concept erasure (LEACE, of Belrose et al. 2023) of these very states: the smallest change, in the
     metric of their own covariance, after which both sides have the same mean.

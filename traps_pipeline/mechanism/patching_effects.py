@@ -61,7 +61,7 @@ ROWS, TOKENS = 64, 2**14  # maximum number of patches in one pass; fewer for lon
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """One patch. positions: (T,) bool, the tokens whose states are replaced."""
+    """A replacement of states at a site and layer. positions: (T,) bool, the tokens whose states are replaced."""
 
     site: Site
     layer: int
@@ -70,7 +70,7 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class RecordedPass:
-    """The recorded decoder part of a pass.
+    """A pass with the recorded states of its decoder, to patch from or into.
 
     inputs: the decoder's arguments, after the vision tower. states: by site and layer, (T, d); always the residual
     stream, other sites on request. margin: the outcome. pictures: which tokens are visual, (T,) bool. per_layer: each
@@ -123,8 +123,8 @@ def _sites(model: LocalModel) -> Iterator[tuple[Site, int, Module]]:
             yield site, layer, part
 
 
-def run_pass(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
-    """Run one pass; keep states of `sites` and of the residual stream for patches.
+def trace_pass(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Sequence[Site] = SITES) -> RecordedPass:
+    """Run one pass and return its record: states of `sites` and of the residual stream.
 
     tokens: those that begin an abstention. Raises TrapsError for a block that passes on more than the residual stream.
     """
@@ -175,7 +175,7 @@ def run_pass(model: LocalModel, prompt: Prompt, tokens: Sequence[int], sites: Se
 def patched_changes(
     model: LocalModel, target: RecordedPass, source: RecordedPass, patches: Sequence[Patch], tokens: Sequence[int]
 ) -> np.ndarray:
-    """Measure the change of the target's outcome by each patch, (patches,).
+    """Return by how much each patch changes the target's outcome, (patches,), measured.
 
     Patches at one block share passes that begin there; the vision tower is not run again. Every pass has one row
     without a patch, and changes are relative to that row, so that rounding by the size of a batch does not count; what
@@ -201,7 +201,7 @@ def patched_changes(
 def attributed_changes(
     model: LocalModel, target: RecordedPass, source: RecordedPass, tokens: Sequence[int]
 ) -> dict[tuple[Site, int], np.ndarray]:
-    """Estimate the outcome's change by each token's patch, (T,) by site and layer.
+    """Return by how much a patch of each token would change the outcome, (T,) by site and layer, estimated.
 
     One pass with gradients gives all of them, to first order; the estimate of a group of positions is its sum. Raises
     TrapsError as `patched_changes`.

@@ -33,7 +33,7 @@ from traps_pipeline.mechanism.patching_effects import (
     attributed_changes,
     patched_changes,
     require_patchable,
-    run_pass,
+    trace_pass,
 )
 from traps_pipeline.mechanism.probing_versions import extraction_version
 from traps_pipeline.models.local.spans import changed_tokens, token_spans
@@ -60,7 +60,7 @@ Cell = tuple[str, Site, int, str]  # patched side, site, layer, group
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """A side of a pair: its prompt and its own groups of positions."""
+    """The control or the void of a pair: its prompt, and groups of the positions of its tokens."""
 
     prompt: Prompt
     parts: Mapping[str, np.ndarray]
@@ -85,7 +85,7 @@ def patching_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
 
 
 class Pairs:
-    """The patched pairs of a dataset, and the files with each pair's results."""
+    """The pairs of a dataset that are patched, with the files of each pair's results."""
 
     def __init__(
         self,
@@ -157,7 +157,7 @@ class Pairs:
                 if side == patched_side and groups[group].any()
             ]
             patches = [Patch(site, layer, groups[group]) for site, layer, group in cells]
-            target_pass, source_margin = run_pass(self._model, target.prompt, self._tokens, ()), 0.0
+            target_pass, source_margin = trace_pass(self._model, target.prompt, self._tokens, ()), 0.0
             for kind in SOURCES:
                 side = self._source(name, patched_side, kind)
                 if side is None:
@@ -172,15 +172,15 @@ class Pairs:
 
     def _attribute(self, target: Side, source: Side) -> tuple[tuple[float, float], dict[tuple[Site, int], np.ndarray]]:
         """Return both sides' margins and each token's estimate; free the states."""
-        target_pass = run_pass(self._model, target.prompt, self._tokens, ())
-        source_pass = run_pass(self._model, source.prompt, self._tokens, self._settings.sites)
+        target_pass = trace_pass(self._model, target.prompt, self._tokens, ())
+        source_pass = trace_pass(self._model, source.prompt, self._tokens, self._settings.sites)
         return (target_pass.margin, source_pass.margin), attributed_changes(
             self._model, target_pass, source_pass, self._tokens
         )
 
     def _patch(self, target: RecordedPass, side: Side, patches: Sequence[Patch]) -> tuple[float, np.ndarray]:
         """Return a source's margin, and the changes by its patches; free its states."""
-        source = run_pass(self._model, side.prompt, self._tokens, self._settings.sites)
+        source = trace_pass(self._model, side.prompt, self._tokens, self._settings.sites)
         return source.margin, patched_changes(self._model, target, source, patches, self._tokens)
 
     def _directions(self, name: str) -> Iterator[tuple[str, Side, Side, dict[str, np.ndarray] | None]]:
@@ -244,7 +244,7 @@ def _has_same_form(target: Mapping[str, np.ndarray], source: Mapping[str, np.nda
 
 
 def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
-    """Return a pair's groups of positions, (T,) bool; None if prompts differ in form.
+    """Return by name a pair's groups of token positions, (T,) bool; None if prompts differ in form.
 
     A model whose pixels do not lie token by token (LLaVA-NeXT-Video, Gemma 4) has no group of unchanged visual tokens:
     all count as changed.
@@ -260,7 +260,7 @@ def groups_of(target: Side, source: Side) -> dict[str, np.ndarray] | None:
 
 
 def best_cells(estimates: Sequence[Row], settings: PatchingSettings, n_layers: int) -> list[Cell]:
-    """Return each direction's cells with the largest estimates over all pairs.
+    """Return the sites, layers and groups of each direction with the largest estimates over all pairs.
 
     Only some layers count, at equal steps. All positions of the residual stream together are left out; their effect is
     1 by construction.
@@ -344,7 +344,7 @@ def effect_of(
 
 
 def shown_times(shown: Frames, clip: Path, spec: MediaSpec, times: Path | None) -> np.ndarray:
-    """Return a clip's shown times (N,) s: its own, or another clip's, spread evenly."""
+    """Return the times (N,) s of a clip's shown frames: its own, or another clip's, spread evenly."""
     if times is None or times == clip:
         return shown.times_s
     sampled_s = pick_frames(times, spec).times_s

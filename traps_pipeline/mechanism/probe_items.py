@@ -16,7 +16,7 @@ COPIED = ("pair_id", "scenario_id", "side", "category", "sub_scenario", "questio
 
 
 def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
-    """Return rows of a dataset's probe_items.
+    """Return a dataset's PROBE_ITEMS rows.
 
     These are the dataset's items, or occlusion's void clips with the answerable question.
     """
@@ -42,7 +42,7 @@ def probe_items(workspace: Workspace, dataset: str) -> list[ProbeItemRow]:
 
 
 def other_clip(workspace: Workspace, row: Mapping[str, Any]) -> tuple[Path, str]:
-    """Return the clip that a row of PROBE_ITEMS is compared with, and its SHA-256.
+    """Return path and SHA-256 of the clip that a row of PROBE_ITEMS is compared with.
 
     It is the clip of the other side of the scenario, whichever question the row has, and for any other clip (an arm's)
     the control's. So an ill-posed row, whose two sides have one clip, is compared at the position of the scenario's

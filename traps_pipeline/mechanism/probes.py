@@ -19,20 +19,20 @@ _TOLERANCE, _MAX_STEPS = 1e-10, 200
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Items at a layer: states (n, d), labels void (n,) bool, scenario (n,) int."""
+    """A dataset's items at a layer: states (n, d), labels void (n,) bool, scenario (n,) int."""
 
     states: np.ndarray
     void: np.ndarray
     scenario: np.ndarray
 
     def rows(self, chosen: np.ndarray) -> Split:
-        """Return the selected items; chosen is a mask or indices."""
+        """Return the split of the selected items; chosen is a mask or indices."""
         return Split(self.states[chosen], self.void[chosen], self.scenario[chosen])
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A fitted probe: mean, scale, and weights (d,) that apply to standardised states."""
+    """A fitted linear probe: mean, scale, and weights (d,) that apply to standardised states."""
 
     mean: np.ndarray = field(repr=False)
     scale: np.ndarray = field(repr=False)
@@ -40,13 +40,13 @@ class Probe:
     intercept: float
 
     def scores(self, states: np.ndarray) -> np.ndarray:
-        """Return log-odds of void, (n,), for states (n, d)."""
+        """Return the log-odds of void, (n,), for states (n, d)."""
         slope = self.weights / self.scale
         return states @ slope + (self.intercept - self.mean @ slope)
 
 
 class Scorer(Protocol):
-    """A fitted scorer of states, higher for void."""
+    """A fitted scorer of states; the scores of voids are higher."""
 
     def scores(self, states: np.ndarray) -> np.ndarray:
         """Return scores (n,) of states (n, d)."""
@@ -70,7 +70,7 @@ def standardiser(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_probe(states: np.ndarray, void: np.ndarray) -> Probe:
-    """Return the probe of states (n, d), labels (n,). Raises TrapsError for one class."""
+    """Return the probe fitted on states (n, d), labels (n,). Raises TrapsError for one class."""
     _check_labels(void)
     states = np.asarray(states, float)
     mean, scale = standardiser(states)
@@ -88,7 +88,7 @@ def _check_labels(void: np.ndarray) -> None:
 
 
 def solve_gram(gram: np.ndarray, void: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return dual (n,) and intercept of logistic regression on a Gram matrix (n, n).
+    """Return the dual (n,) and the intercept of logistic regression on a Gram matrix (n, n).
 
     The intercept is unpenalised. The coefficients of the columns are the rows' transpose times the dual.
 
@@ -182,7 +182,7 @@ class _NewtonStep:
 
 
 def auroc(void: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return AUROC of scores, (n,) -> () or (n, k) -> (k,), against labels (n,).
+    """Return the AUROC of scores, (n,) -> () or (n, k) -> (k,), against labels (n,).
 
     Ties count half, by mean ranks (Mann and Whitney). NaN if one class has no item.
     """
@@ -237,7 +237,7 @@ def auroc_draws(void: np.ndarray, scores: np.ndarray, scenario: np.ndarray, weig
 
 
 def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
-    """Return each item's fold, (n,) int; a scenario's items share one.
+    """Return the fold of each item, (n,) int; a scenario's items share one.
 
     Fold sizes differ by at most one scenario. Raises TrapsError if there are fewer scenarios than folds.
     """
@@ -250,8 +250,8 @@ def scenario_folds(scenario: np.ndarray, folds: int, seed: int) -> np.ndarray:
     return place[np.searchsorted(names, scenario)]
 
 
-def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
-    """Return labels (n, shuffles), with sides swapped at random within scenarios.
+def side_swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: int) -> np.ndarray:
+    """Return labels (n, shuffles) in which random scenarios have swapped control and void.
 
     Each scenario is swapped with probability 0.5. A swap keeps every fold balanced, and any labels of a held-out fold
     are as likely as their complement, so that the expected AUROC is exactly 0.5. A free permutation, which unbalances
@@ -263,7 +263,7 @@ def swapped_labels(void: np.ndarray, scenario: np.ndarray, shuffles: int, seed: 
 
 
 def within_split(split: Split, labels: np.ndarray, folds: np.ndarray) -> np.ndarray:
-    """Return cross-validated AUROC, averaged over folds: labels (n, k) -> (k,).
+    """Return the cross-validated AUROC, averaged over folds, of each column of labels: (n, k) -> (k,).
 
     Standardiser and probe use only the training folds; all labellings share the Gram matrix of a fold.
     """

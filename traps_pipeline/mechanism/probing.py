@@ -23,7 +23,7 @@ from traps_pipeline.mechanism.probes import (
     fit_probe,
     nearest_centroid,
     scenario_folds,
-    swapped_labels,
+    side_swapped_labels,
     transfer_scores,
     within_split,
 )
@@ -46,19 +46,19 @@ ReadLayer = Callable[[str, int], np.ndarray]  # dataset, layer -> states (n, d) 
 
 
 class NothingConfabulated(TrapsError):
-    """A dataset has no void item that the model answered."""
+    """Raised for a dataset without any void item that the model answered."""
 
 
 @dataclass(frozen=True)
 class Confabulated:
-    """The scenarios with a confabulated void, by dataset, or why one is missing."""
+    """The scenarios whose void the model answered, by dataset, or why there are none."""
 
     scenarios: Mapping[str, frozenset[str]]
     problems: Mapping[str, str] = field(default_factory=dict)
 
 
 def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> frozenset[str]:
-    """Return the scenarios on whose void the model did not abstain, if decided.
+    """Return the ids of the scenarios whose void the model is judged to have answered.
 
     verdicts: those of the dataset under Standard in run 1. Raises NothingConfabulated if there is no such scenario.
     """
@@ -74,7 +74,7 @@ def confabulated_scenarios(verdicts: pd.DataFrame, dataset: str, model: str) -> 
 
 @dataclass
 class ProbeRun:
-    """The probes of one model under one VQA prompt.
+    """The probes of one model under one VQA prompt, which return rows of PROBES.
 
     items: the id table, with the columns dataset, scenario_id, side and sub_scenario.
     """
@@ -135,7 +135,7 @@ class ProbeRun:
     def rows(
         self, progress: Callable[[int, int], None] = lambda layers_done, total: None, *, comparable: bool = False
     ) -> list[Row]:
-        """Return every row of the probes table without the columns that partition it.
+        """Return every row of PROBES without the columns that partition it.
 
         comparable: without those within a dataset and those of centroids.
         """
@@ -147,7 +147,7 @@ class ProbeRun:
         return mark_layers(rows + self._problems())
 
     def layer_rows(self, layer: int) -> list[Row]:
-        """Return every row of one layer, whose states are in memory only during this call."""
+        """Return every row of one layer; its states are in memory only during this call."""
         splits = {name: self._split(name, layer) for name in self._datasets}
         rows = self.comparable_rows(layer, splits) + self.within(layer, splits)
         return rows + (self.centroids(layer, splits) if layer == self.centroid_layer else [])
@@ -161,7 +161,7 @@ class ProbeRun:
         return rows + self.answerable(layer, splits, unseen_scores)
 
     def transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the twelve ordered pairs on all samples.
+        """Return rows of the twelve ordered pairs of datasets, on all samples.
 
         The two datasets of a taxonomy share their control items, so that half of the rows of a cross-modality target
         were used in the fit (see `held_out`).
@@ -170,7 +170,7 @@ class ProbeRun:
         return [self._score_row("transfer", path, layer, splits[path[1]], values) for path, values in scores.items()]
 
     def confabulated_transfer(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return the transfer's pairs whose void the model confabulated on, with their controls."""
+        """Return rows of transfer on the pairs whose void the model answered (Cf->Cf)."""
         confabulated_splits = self._confabulated_splits(splits)
         pairs = [pair for pair in self._pairs if set(pair) <= set(confabulated_splits)]
         scores = transfer_scores(confabulated_splits, pairs, self.fit)
@@ -179,7 +179,7 @@ class ProbeRun:
         ]
 
     def confabulated_held_out(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return Cf->Cf within a taxonomy by held-out probes, null with few scenarios."""
+        """Return rows of Cf->Cf within a taxonomy by held-out probes, null with few scenarios."""
         confabulated_splits, rows = self._confabulated_splits(splits), []
         for source, target in self._pairs:
             if not {source, target} <= set(confabulated_splits) or taxonomy_of(source) != taxonomy_of(target):
@@ -213,12 +213,12 @@ class ProbeRun:
         return {name: np.array([fold_of[s] for s in split.scenario]) for name, split in splits.items()}
 
     def within(self, layer: int, splits: Mapping[str, Split]) -> list[Row]:
-        """Return cross-validation within each dataset, with true and swapped labels."""
+        """Return rows of cross-validation within each dataset, with true and side-swapped labels."""
         rows = []
         for name in self._own:
             split = splits[name]
             folds = scenario_folds(split.scenario, self.settings.folds, self.seed)
-            shuffled_labels = swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
+            shuffled_labels = side_swapped_labels(split.void, split.scenario, self.settings.shuffles, self.seed)
             areas = within_split(split, np.column_stack([split.void, shuffled_labels]), folds)
             shuffled_areas = areas[1:]
             rows.append(_row("within", (name, name), layer, areas[0], split))
@@ -230,14 +230,14 @@ class ProbeRun:
     def held_out(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return the pairs within a taxonomy, by probes that hold out the scenario."""
+        """Return rows of the dataset pairs within a taxonomy, by probes that hold out the scenario."""
         pairs = [(s, t) for s in self._own for t in self._own if taxonomy_of(s) == taxonomy_of(t)]
         return [self._score_row("held_out", (s, t), layer, splits[t], unseen[s][t]) for s, t in pairs]
 
     def answerable(
         self, layer: int, splits: Mapping[str, Split], unseen: Mapping[str, Mapping[str, np.ndarray]]
     ) -> list[Row]:
-        """Return answerable clips that resemble voids, scored by each dataset's probes.
+        """Return rows of answerable clips that resemble voids, scored by each dataset's probes.
 
         These are void clips with an answerable question, and whole clips as short as a void. answerable_void: AUROC of
         void items against these; 0.5 for a probe that detects what both have (an occluder, the length), 1 for a probe
@@ -287,7 +287,7 @@ class ProbeRun:
         return scores
 
     def centroids(self, layer: int, splits: Mapping[str, Split] | None = None) -> list[Row]:
-        """Return shares of items that the source's nearest centroid assigns to void.
+        """Return rows of the shares of items that the source's nearest centroid assigns to void.
 
         The centroids of a taxonomy's two datasets come from the same controls, so these shares are too low for
         controls.
@@ -358,7 +358,7 @@ def _row(
 
 
 def mark_layers(rows: Sequence[Row]) -> list[Row]:
-    """Mark, in rows of probes, the layers that the report's tables show.
+    """Return the rows of probes with marks on the layers that the report's tables show.
 
     own_best: the maximum of the row's own curve (the paper's choice, which uses target labels); all_sample_best: the
     maximum of the pair's all-sample transfer curve; chosen: the layer of the target without its labels

@@ -34,7 +34,7 @@ def mechanism_entry(entry: ModelEntry, settings: MechanismSettings) -> ModelEntr
 
 
 def joined_models(entry: ModelEntry, settings: MechanismSettings) -> str | None:
-    """Return which two models a row joins that has a model's states and its answers; None for one.
+    """Return in words the two models that a row joins (one of states, one of answers); None for one.
 
     They are two if the entry is looked into in another precision than it answers in, or on other frames.
     """
@@ -52,7 +52,7 @@ def joined_models(entry: ModelEntry, settings: MechanismSettings) -> str | None:
 
 
 def states_folder(workspace: Workspace, cell: StatesCell) -> Path:
-    """Return the folder of a partition's shards."""
+    """Return the path of the folder of a partition's shards."""
     return workspace.root / "states" / cell.extraction.model / cell.extraction.prompt / cell.dataset
 
 

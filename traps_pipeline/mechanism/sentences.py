@@ -32,7 +32,7 @@ OWN_TOKENS = 64  # tokens of the model's own answer, from its beginning
 
 
 def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extraction) -> list[SentenceRow]:
-    """Return SENTENCES rows of every item of the pairs, with the answer of run 1.
+    """Return SENTENCES rows: for every item of the pairs, the log-probabilities of an abstention and of the answer.
 
     The prompt is the benchmark's of the extraction's name. Raises TrapsError for a model that was not evaluated under
     it.
@@ -80,12 +80,12 @@ def sentence_rows(workspace: Workspace, entry: ModelEntry, extraction: Extractio
 
 
 def answer_tokens(model: LocalModel, text: str) -> list[int]:
-    """Return the tokens of a text as an answer."""
+    """Return the token ids of a text as a model's answer contains them: without special tokens around it."""
     return model.processor.tokenizer(text, add_special_tokens=False).input_ids
 
 
 def mean_log_probabilities(model: LocalModel, prompt: Prompt, answers: Sequence[Sequence[int]]) -> list[float]:
-    """Return the mean log-probability of each answer's tokens behind a prompt, in nats.
+    """Return the mean log-probability (nats) of each answer's tokens after a prompt.
 
     The prompt is read once; then all answers in one pass, which reads its keys and values. Shorter answers are filled
     up on the right, where no token of theirs looks.

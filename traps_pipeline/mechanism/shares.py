@@ -1,4 +1,4 @@
-"""Compute a steered model's abstention by path and path set (docs/spec.md 8.4).
+"""Compute a steered model's abstention by steering path and set of paths (docs/spec.md 8.4).
 
 They are computed from STEERING and STEERING_VOTES rows. A path asks each scenario once, so its Wilson interval covers
 the variation of scenarios. Several paths ask the same scenario, and one answer may count in several paths; intervals
@@ -41,12 +41,12 @@ _PATH_SETS = {ALL: STEERING_PATHS, **PATH_SETS}
 
 
 def paper_protocol_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of the paper's protocol: void or unsteered, alphas, signs by label."""
+    """Return the rows of the paper's protocol: void or unsteered, alphas, signs by label."""
     return rows.loc[rows["kind"].isin(["void", UNSTEERED]) & (rows["unit"] == "alpha") & (rows["signs"] == "label")]
 
 
 def answers_of_paths(answers: pd.DataFrame, votes: pd.DataFrame, fluency: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return answers with verdicts (and `nats` by `fluency`), one row per path; alpha 0 belongs to every path."""
+    """Return steered answers with verdicts (and `nats` by `fluency`), one row per path that they belong to."""
     columns = ["side", "alpha", "scenario_id", "alpha_relative", "degenerate", "request_key", "epoch"]
     judged_answers = _with_verdicts(pd.DataFrame(answers[[*_ANSWER, *columns]]), votes)
     keys = [*_CELL, "item_id", "request_key"]
@@ -77,7 +77,7 @@ def _with_verdicts(answers: pd.DataFrame, votes: pd.DataFrame) -> pd.DataFrame:
 def effect_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, fluency: pd.DataFrame | None = None
 ) -> list[SteeringEffectRow]:
-    """Return STEERING_EFFECTS rows: abstention by path, dose, kind, draw, layer, side."""
+    """Return STEERING_EFFECTS rows: abstention by path, dose, kind of direction, draw, layer, side."""
     rows: list[SteeringEffectRow] = []
     for key, group in answers_of_paths(answers, votes, fluency).groupby(_EFFECT, sort=True):
         row_keys = dict(zip(_EFFECT, cast(tuple[Any, ...], key), strict=True))
@@ -114,7 +114,7 @@ def effect_rows(
 def share_rows(
     answers: pd.DataFrame, votes: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED
 ) -> list[SteeringShareRow]:
-    """Return STEERING_SHARES rows: the paper's protocol, averaged over path sets.
+    """Return STEERING_SHARES rows: abstention under the paper's protocol, averaged over sets of paths.
 
     There are rows for each regime of directions and of answers and over all regimes, with an interval from resampled
     scenarios (all paths share the scenarios of a resample, and the unseen one).

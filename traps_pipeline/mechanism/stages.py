@@ -114,7 +114,7 @@ def extract_states(workspace: Workspace, cell: StatesCell) -> tuple[list[HiddenS
 
 
 def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: Mapping[str, Any], system: str) -> Item:
-    """Return the item of a row, as the study pools its states. Raises TrapsError if a pooling lacks the other clip."""
+    """Return the forward pass of a row of PROBE_ITEMS. Raises TrapsError if a pooling lacks the other clip."""
     from traps_pipeline.mechanism.hidden_states import clip_item
     from traps_pipeline.models.local.capture import OF_PAIRS
 
@@ -123,7 +123,7 @@ def probed_item(workspace: Workspace, model: LocalModel, spec: MediaSpec, row: M
 
 
 def unsound_layers(workspace: Workspace, cell: StatesCell, n_layers: int) -> list[int]:
-    """Return which of the first and last layers contain non-finite numbers."""
+    """Return those of the first and last layer whose stored states contain non-finite numbers."""
     from traps_pipeline.mechanism.hidden_states import read_layer
 
     folder = workspace.bring_folder(states_folder(workspace, cell))
@@ -149,7 +149,7 @@ def _check_layers(workspace: Workspace, model: str, n_layers: int) -> None:
 
 
 def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
-    """Return rows of an extraction's probes."""
+    """Return PROBES rows of an extraction."""
     examined_model(workspace, extraction.model)
     states, settings = StoredStates.of(workspace, extraction), workspace.mechanism
     is_random = extraction.weights_seed is not None  # which answers nothing
@@ -162,7 +162,7 @@ def probe_rows(workspace: Workspace, extraction: Extraction) -> list[ProbeRow]:
 
 
 def confabulations(workspace: Workspace, model: str) -> Confabulated:
-    """Return scenarios whose void the model answered under standard in run 1, by dataset, or why there are none."""
+    """Return the scenarios whose void the model answered under standard in run 1, by dataset."""
     scenarios: dict[str, frozenset[str]] = {}
     problems: dict[str, str] = {}
     for dataset in DATASETS:
@@ -181,7 +181,7 @@ def confabulations(workspace: Workspace, model: str) -> Confabulated:
 
 
 def directions_file(workspace: Workspace, extraction: Extraction, dataset: str) -> Path:
-    """Return the file of a dataset's directions."""
+    """Return the path of the file of a dataset's directions."""
     return workspace.root / "directions" / extraction.model / extraction.prompt / f"{dataset}.safetensors"
 
 
@@ -203,7 +203,7 @@ def direction_rows(workspace: Workspace, extraction: Extraction) -> list[Directi
 def direction_pairs(
     settings: MechanismSettings, dataset: str, items: pd.DataFrame
 ) -> tuple[list[str], list[int], list[int]]:
-    """Return a direction's scenarios, and the rows of their voids and controls. Raises TrapsError without steering."""
+    """Return a direction's scenarios, and rows of their voids and controls. Raises TrapsError without steering."""
     steering = settings.steering
     if steering is None:
         raise TrapsError(
@@ -266,7 +266,7 @@ def _dataset_directions(workspace: Workspace, states: StoredStates, dataset: str
 
 
 def saved_directions(workspace: Workspace, extraction: Extraction) -> dict[str, Directions]:
-    """Return directions by dataset. Raises TrapsError if a file and the table differ."""
+    """Return the saved directions by dataset. Raises TrapsError if a file and the table differ."""
     table = workspace.tables.read(DIRECTIONS, extraction.partition)
     result = {}
     for path in sorted(set(table["path"])):

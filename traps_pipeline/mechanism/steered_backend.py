@@ -24,7 +24,7 @@ PROMPTS_KEPT = 128  # processed prompts in memory: each one is used for every di
 
 
 class SteeredBackend(LocalBackend):
-    """A local model that answers with a direction added to a block, one for each row."""
+    """A backend that answers with a local model while a direction is added to a block, one for each row."""
 
     def __init__(self, entry: Entry, vectors: Mapping[str, np.ndarray]) -> None:
         super().__init__(entry)
@@ -36,7 +36,7 @@ class SteeredBackend(LocalBackend):
         return self.generate(batch.requests, batch.abandoned.is_set)
 
     def generate(self, batch: Sequence[Request], stopped: Callable[[], bool]) -> list[Outcome]:
-        """Answer requests in groups by layer, unsteered ones apart. stopped: called at every token, ends them early."""
+        """Return answers to requests, made in groups by layer. stopped: called at every token, ends them early."""
         from traps_pipeline.mechanism.hook import Steering
 
         groups: dict[int | None, list[int]] = {}

@@ -64,7 +64,7 @@ class Strength:
     signs: str = BY_LABEL
 
     def signed_alpha(self, side: str) -> float:
-        """Return the signed alpha of a side."""
+        """Return alpha with the sign that the direction has on a side."""
         return sign_of(self.signs, side) * self.alpha
 
 
@@ -89,7 +89,7 @@ class SteeredQuestion(Question):
 def strengths(
     target: str, layers: Layers, settings: MechanismSettings, directions: Mapping[str, Directions]
 ) -> list[tuple[Strength, tuple[str, ...]]]:
-    """Return every strength at which a target is steered, with the sides that are steered so.
+    """Return every strength at which a target is steered, each with the sides that are steered so.
 
     These are every path into the target whose source has a direction, the random and shuffled directions of that
     source, and the sweep over layers (along the target's own direction, only on controls). directions: by source.
@@ -167,7 +167,7 @@ def _plan(target: str, layers: Layers, steering: SteeringSettings, sources: Cont
 def count_answers(
     settings: MechanismSettings, model: str, datasets: Sequence[str], scenarios: Mapping[str, int]
 ) -> dict[str, Counter[str]]:
-    """Return how many steered answers, each once, there are by inference regime and side, of these scenarios."""
+    """Return the numbers of steered answers, each once, by inference regime, then by side."""
     steering = settings.steering
     if steering is None:
         return {}
@@ -225,7 +225,7 @@ def wanted_steered(
 def unsteered_request(
     workspace: Workspace, entry: ModelEntry, item: Mapping[str, Any], cell: SteeringCell, max_new_tokens: int
 ) -> Request:
-    """Return the call at alpha 0: full benchmark prompt, greedy, precision of extraction."""
+    """Return the call at alpha 0: full benchmark prompt, greedy decoding, precision of extraction."""
     assert entry.media is not None, "local entries have media"
     clip = workspace.resolve(item["clip"])
     media = workspace.media.prepare(clip, item["media_digest"], entry.media)
@@ -251,7 +251,7 @@ def steered_request(unsteered: Request, side: str, strength: Strength) -> Reques
 
 
 def ledger_item_id(item: Mapping[str, Any]) -> str:
-    """Return an item's ledger id; a taxonomy's datasets share the ids of controls."""
+    """Return the id of an item in the ledger; a taxonomy's datasets share the ids of controls."""
     dataset = taxonomy_of(item["dataset"]) if item["side"] == "control" else item["dataset"]
     return f"{dataset}:{item['scenario_id']}:{item['side']}"
 

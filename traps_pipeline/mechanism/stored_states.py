@@ -21,7 +21,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 @dataclass
 class StoredStates:
-    """An extraction's id table, and a reader of layers in the order of that table."""
+    """The stored hidden states of an extraction: a table of items, and a reader of layers in its order."""
 
     workspace: Workspace
     extraction: Extraction
@@ -29,7 +29,7 @@ class StoredStates:
 
     @staticmethod
     def of(workspace: Workspace, extraction: Extraction, datasets: Sequence[str] = PROBED_DATASETS) -> StoredStates:
-        """Return an extraction's states of datasets. Raises TrapsError if nothing was extracted."""
+        """Return the stored states of an extraction for datasets. Raises TrapsError if there are none."""
         items = workspace.tables.read_all(HIDDEN_STATES, dataset=datasets, **extraction.partition)
         if items.empty:
             raise TrapsError(f"no hidden states of {extraction.key}; materialize hidden_states for it first")
@@ -37,7 +37,7 @@ class StoredStates:
 
     @staticmethod
     def of_random(workspace: Workspace, model: str) -> list[StoredStates]:
-        """Return states of a model's network with random weights, for each seed that was extracted."""
+        """Return the stored states of a model's network with random weights, one for each extracted seed."""
         entry = get_model(model)
         extractions = [Extraction(model, name) for name in RANDOM_WEIGHTS if entry.has_random_weights]
         made = workspace.tables.partitions(HIDDEN_STATES)
@@ -49,7 +49,7 @@ class StoredStates:
 
     @property
     def n_layers(self) -> int:
-        """Number of layers, the embeddings included."""
+        """The number of layers, the embeddings included."""
         return int(self.items["n_layers"].iloc[0]) + 1
 
     @property
@@ -59,11 +59,11 @@ class StoredStates:
         return {**self.extraction.partition, "joins": joined_models(entry, self.workspace.mechanism)}
 
     def dataset(self, name: str) -> pd.DataFrame:
-        """Return the rows of a dataset."""
+        """Return the table's rows of a dataset."""
         return self.items.loc[self.items["dataset"] == name]
 
     def read_as(self, order: StoredStates, dataset: str, layer: int | Literal["normed"]) -> np.ndarray:
-        """Read hidden states in the order of another extraction's items."""
+        """Return states (n, d) in the order of another extraction's items."""
         places = pd.Index(self.dataset(dataset)["item_id"]).get_indexer(pd.Index(order.dataset(dataset)["item_id"]))
         if (places < 0).any():
             raise TrapsError(

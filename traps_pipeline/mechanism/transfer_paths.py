@@ -42,10 +42,10 @@ def probed_taxonomy(dataset: str) -> str:
 
 
 def path_name(source: str, target: str) -> str:
-    """Return `oc→ch_ip`, as tables show it."""
+    """Return the name of a steering path as tables show it: `oc→ch_ip`."""
     return f"{SHORT.get(source, source)}→{SHORT.get(target, target)}"
 
 
 def sources_of(target: str) -> tuple[str, ...]:
-    """Return the datasets whose directions steer a target."""
+    """Return the names of the datasets whose directions steer a target."""
     return tuple(source for source, path_target in STEERING_PATHS if path_target == target)

@@ -35,6 +35,6 @@ def media_for_dataset(spec: MediaSpec, dataset: str) -> MediaSpec:
 
 
 def observer_frames(dataset: str) -> FramePolicy:
-    """Return the frames that the observer sees: 5 a second, or the dataset's."""
+    """Return the policy by which the observer's frames are picked: 5 a second, or the dataset's."""
     spec = media_for_dataset(MediaSpec(profile="frames", fps=5), dataset)
     return FramePolicy(spec.fps, spec.uniform, spec.most, spec.later)

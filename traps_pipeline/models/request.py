@@ -1,4 +1,4 @@
-"""Define the two values that every backend speaks: `Request -> Outcome`."""
+"""Define the two values that every backend handles: `Request -> Outcome`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VERBATIM = 600  # texts up to this length are stored verbatim in the key's comp
 
 @dataclass(frozen=True)
 class Request:
-    """One complete call: everything that decides the answer, and nothing else.
+    """A complete call: all that decides the answer, and nothing else.
 
     participant: model or judge. endpoint: kind of backend. params: exactly what is sent. about: the item, model,
     regime, run (and task) of the call: repeated questions are calls of their own. secret: facts only for a reference
@@ -96,7 +96,7 @@ class Outcome:
 
 
 class TransientError(Exception):
-    """A failure worth a retry: time-out, 408, 409, 429, 5xx, or a broken answer.
+    """Raised for a failure worth a retry: time-out, 408, 409, 429, 5xx, or a broken answer.
 
     billed: whether the provider may charge for it; cost_usd: the stated charge, if any, else the worst case counts;
     raw: see `Outcome`; why: what went wrong, or why a call was not sent, for people.
@@ -118,7 +118,7 @@ class TransientError(Exception):
 
     @property
     def outcome(self) -> Outcome:
-        """The outcome if there is no retry left."""
+        """The outcome to record if there is no retry left."""
         return Outcome("malformed" if self.kind == MALFORMED else "error", error=self.kind, raw=self.raw)
 
 

@@ -175,7 +175,7 @@ def strata(population: pd.DataFrame) -> pd.Series:
     )
 
 
-def queue_of(who: str, sampled: pd.DataFrame) -> list[str]:
+def personal_order(who: str, sampled: pd.DataFrame) -> list[str]:
     """Return the units of a sample in one person's order, seeded by their name."""
     seed = annotation_protocol().seed
     return sorted(map(str, sampled["unit"]), key=lambda unit: digest([seed, who, unit]))

@@ -21,7 +21,7 @@ OWNERS = ["team:benchmark"]
 
 
 class WorkspaceResource(dg.ConfigurableResource):
-    """The workspace of a run: that of the study whose partitions are loaded.
+    """The Dagster resource that opens the workspace of the study whose partitions are loaded.
 
     It is no run configuration. Dagster stores that with a run, so a run repeated in a copy of the study would write to
     the original.
@@ -30,7 +30,7 @@ class WorkspaceResource(dg.ConfigurableResource):
     _steps: ExitStack = PrivateAttr(default_factory=ExitStack)
 
     def until_torn_down(self, events: Generator[Event, None, None]) -> Iterator[Event]:
-        """Forward a step's events, and close the step when the run ends at the latest.
+        """Yield the events of a step, and close the step when the run ends at the latest.
 
         Dagster abandons a step if it cannot write an event. Closing it here stores the calls in flight and releases its
         locks; the garbage collector would wait forever for the threads of these calls.
@@ -49,7 +49,7 @@ class WorkspaceResource(dg.ConfigurableResource):
 
 
 def assets_of(graph: Graph) -> list[dg.AssetsDefinition]:
-    """Return an asset for each stage, and an observable one for each source."""
+    """Return Dagster's assets: one for each stage, and an observable one for each source."""
     return [
         _asset(graph, declaration) if isinstance(declaration, Stage) else _observable(declaration)
         for declaration in graph.declared.values()

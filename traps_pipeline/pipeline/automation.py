@@ -66,7 +66,7 @@ def reread_sources() -> None:
 
 
 def jobs() -> list[Any]:
-    """Return a job per part of the graph and one for all, once stages are declared."""
+    """Return a Dagster job for each part of the graph and one for all, once stages are declared."""
     stages = the_graph().stages
     parts = {name: [s for s in stages if s.group in groups] for name, groups in JOB_GROUPS.items()}
     everything_job = _job(EVERYTHING, "All that the study asks, from scenarios to the report.", stages)

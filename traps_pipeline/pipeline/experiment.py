@@ -109,7 +109,7 @@ class Experiment(Settings):
 
     @property
     def forms(self) -> set[str]:
-        """The regimes that stand for what calls ask for beside plain text: an object of a schema, log-probabilities."""
+        """The regimes whose calls ask for more than plain text: an object of a schema, or log-probabilities."""
         is_structured = self.canary or any(fields_of(r, d) for r in self.regimes for d in self.datasets)
         return {r for r in self.regimes if BY_NAME[r].first_token} | ({"json"} if is_structured else set())
 
@@ -120,7 +120,7 @@ class Experiment(Settings):
         return Asked(**values, mechanism=self.mechanism is not None)
 
     def judged(self, study: Study | None, panel: str | None, *, judged_by_rules: bool = False) -> Study:
-        """Return the study with the panel of the command, else of the experiment.
+        """Return the study's settings with the panel of the command, else of the experiment.
 
         Without either it keeps the panel of `study` (None: a new study). Raises TrapsError for no panel, for two, and
         if rules would judge models without an explicit request.
@@ -156,7 +156,7 @@ class Experiment(Settings):
             )
 
     def cells(self) -> list[Cell]:
-        """Return cells by model, up to its runs. Raises TrapsError for an unknown model."""
+        """Return the experiment's cells in order of models, up to its runs. Raises TrapsError for an unknown model."""
         return [Cell(dataset, evaluation) for evaluation in evaluations_of(self.asked) for dataset in self.datasets]
 
 

@@ -45,7 +45,7 @@ LABEL_TOKENS = 2500  # estimated prompt of a label: instructions, answer and, fo
 
 @dataclass
 class Count:
-    """Numbers of calls: all that are wanted, and those already in the ledger (known)."""
+    """The number of wanted calls, and of those that the ledger already answers (known)."""
 
     wanted: int = 0
     known: int = 0
@@ -81,14 +81,14 @@ class CallPlan:
 
     @property
     def minutes(self) -> float:
-        """Minutes of all calls: models run in parallel, and then judges."""
+        """The minutes that all calls take: models run in parallel, and then judges."""
         models = [row for row in self.forecasts if row.participant in self.calls]
         judges = [row for row in self.forecasts if row.participant not in self.calls]
         return minutes_of(models) + minutes_of(judges)
 
 
 def plan_calls(plan: RunPlan | None, experiment: Experiment, study: Study, card: str = "H100") -> CallPlan:
-    """Count an experiment's calls and forecast their cost; nothing is sent or written.
+    """Return an experiment's calls with a forecast of their cost; nothing is sent or written.
 
     plan: of its workspace, None for a new one. study: with the panel that judges. card: one of CARDS.
     """

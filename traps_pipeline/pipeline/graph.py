@@ -44,7 +44,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Parent:
-    """An upstream asset of a stage.
+    """An upstream asset of a stage, and how its partitions are chosen and needed.
 
     mapping: selects its partitions (default: the same key if both are partitioned alike, else all). need: how many of
     the partitions that the study wants must exist.
@@ -81,7 +81,7 @@ class RunResources:
 
 @dataclass(frozen=True)
 class ConcurrentBuild:
-    """How several runs build one partition: its files together, then one builds it.
+    """The functions by which several runs build one partition: its files together, then one run builds it.
 
     The other runs adopt the finished partition. files: makes the files that no other run is making, optionally waits
     until none is missing, and returns the work done here and whether all exist. seconds: estimates one core's time for
@@ -121,11 +121,11 @@ class Stage:
     side_by_side: bool = False
 
     def columns(self, key: str | None) -> Mapping[str, Any]:
-        """Return values of the table's partition columns for a key."""
+        """Return the values of the table's partition columns, by name, for a key."""
         return {} if self.scheme is None or key is None else self.scheme.columns(key)
 
     def wanted(self, partitions: StudyPartitions) -> list[str | None]:
-        """Return the keys that a study wants, in key order."""
+        """Return the partition keys that a study wants, in key order."""
         keys: Sequence[str | None] = [None] if self.scheme is None else self.scheme.wanted(partitions)
         return [key for key in keys if self.wants(partitions, key)]
 
@@ -135,13 +135,13 @@ DECLARED: dict[str, Stage | Source] = {}  # by name; filled as stages are import
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """All stages and sources, their keys, and each partition's upstream partitions."""
+    """All declared stages and sources, their partition keys, and each partition's upstream partitions."""
 
     declared: Mapping[str, Stage | Source] = field(default_factory=lambda: DECLARED)
 
     @cached_property
     def parents_of(self) -> Mapping[str, Mapping[str, Parent]]:
-        """Upstream assets of each stage, by name; empty for a source."""
+        """The upstream assets of each stage, by name; empty for a source."""
         return {
             name: declaration.parents if isinstance(declaration, Stage) else {}
             for name, declaration in self.declared.items()
@@ -163,7 +163,7 @@ class Graph:
 
     @cached_property
     def sources(self) -> list[str]:
-        """Names of all sources: files that people edit and stages read."""
+        """The names of all sources: files that people edit and stages read."""
         return [name for name, declaration in self.declared.items() if isinstance(declaration, Source)]
 
     def blocks(self, names: Collection[str] | None = None) -> list[list[Stage]]:
@@ -199,20 +199,20 @@ class Graph:
         return [stage for block in self.blocks() for stage in block]
 
     def above(self, names: Iterable[str]) -> set[str]:
-        """Return the stages of these names, and all stages upstream of them."""
+        """Return the names of these stages, and of all stages upstream of them."""
         return {name for name in _reached(names, self.parents_of.__getitem__) if isinstance(self.declared[name], Stage)}
 
     def below(self, name: str) -> set[str]:
-        """Return the stages directly downstream of a stage."""
+        """Return the names of the stages directly downstream of a stage."""
         return {child for child, parents in self.parents_of.items() if name in parents}
 
     def all_below(self, name: str) -> set[str]:
-        """Return a stage and all stages downstream of it."""
+        """Return the names of a stage and of all stages downstream of it."""
         return _reached([name], self.below)
 
     @cache  # noqa: B019 - a graph lives as long as its process
     def keys(self, name: str) -> list[str | None]:
-        """Return all partition keys of a stage or source."""
+        """Return all partition keys of a stage or source, in order."""
         scheme = self.declared[name].scheme
         return [None] if scheme is None else [*scheme.keys]
 
@@ -229,7 +229,7 @@ class Graph:
         }  # fmt: skip
 
     def mapping(self, name: str, parent: str) -> KeyMapping:
-        """Return the mapping that selects a partitioned parent's partitions for a stage."""
+        """Return the mapping by which a stage's partition selects partitions of a partitioned parent."""
         scheme, stated_mapping = self.declared[name].scheme, self.parents_of[name][parent].mapping
         return stated_mapping or (SAME if scheme is self.declared[parent].scheme else EVERY)
 
@@ -244,7 +244,7 @@ def _reached(names: Iterable[str], neighbours: Callable[[str], Iterable[str]]) -
 
 
 def name_of(node: Node) -> str:
-    """Return `stage` or `stage/key`, as footers store it."""
+    """Return a partition's name as footers store it: `stage` or `stage/key`."""
     return node[0] if node[1] is None else f"{node[0]}/{node[1]}"
 
 

@@ -36,7 +36,7 @@ class History:
         )
 
     def provenance(self, stage: Stage) -> dict[str, str]:
-        """Return tags that name the parents' current events; call before reading inputs."""
+        """Return Dagster tags that name the parents' current events; call before reading inputs."""
         tags: dict[str, str] = {}
         for parent in stage.parents:
             key = asset_key(parent)

@@ -23,7 +23,7 @@ _OF_VOTE = ("item_id", "task", "abstained", "correct", "valid", "judge", "ration
 
 
 def explain_item(workspace: Workspace, item_id: str) -> dict[str, Any]:
-    """Return an item's question, clip if it is current, and the state of its answers.
+    """Return an item's question, clip if it is current, and the state of its answers, as JSON values.
 
     For every evaluation that has asked it: whether its answer is valid or which component of the key changed, with the
     answer and its votes. Raises TrapsError for an unknown item.
@@ -62,7 +62,7 @@ def explain_item(workspace: Workspace, item_id: str) -> dict[str, Any]:
 
 
 def lines_of(explanation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield an explanation as lines of text."""
+    """Yield the lines of text that print an explanation."""
     if "question" in explanation:
         yield f"question: {explanation['question']}"
         yield f"ground truth: {explanation['ground_truth']}"

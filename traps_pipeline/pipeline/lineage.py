@@ -23,7 +23,7 @@ Value = TypeVar("Value")
 
 
 def failed_calls(count: int) -> str:
-    """Return the number of a partition's failed calls, with the remedy, in words."""
+    """Return in words how many calls of a partition failed, with the remedy."""
     return (
         f"{count_noun(count, 'call')} failed; a new run of this partition asks {'it' if count == 1 else 'them'} again"
     )
@@ -34,7 +34,7 @@ OTHER_COLUMNS = "made by a version with other columns"
 
 @dataclass(frozen=True)
 class Status:
-    """A partition's status, its changed inputs, and its number of failed calls."""
+    """The status of a partition, its changed inputs, and its number of failed calls."""
 
     kind: Literal["fresh", "stale", "missing"]
     outdated: tuple[str, ...] = ()
@@ -42,7 +42,7 @@ class Status:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why it is stale, in words."""
+        """Sentences on why the partition is stale."""
         return (*self.outdated, failed_calls(self.failed)) if self.failed else self.outdated
 
 
@@ -64,7 +64,7 @@ class _Once(Generic[Value]):
 
 
 class Lineage:
-    """A snapshot of a workspace that looks each version up once."""
+    """The versions and statuses of a workspace's partitions, each looked up once."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace, self.graph, self._thorough = workspace, the_graph(), False
@@ -76,11 +76,11 @@ class Lineage:
         self._wanted = cache(lambda name: {*self.graph[name].wanted(self.partitions)})
 
     def renew(self, stage: str) -> None:
-        """Forget a stage that has been built since, and all stages downstream of it."""
+        """Look up anew a stage that has been built since, and all stages downstream of it."""
         self._forget(self.graph.all_below(stage))
 
     def read_in_full(self) -> None:
-        """Look again, and from now on compare every table with its checksum."""
+        """Look everything up anew, and from now on compare every table with its checksum."""
         if not self._thorough:
             self._thorough = True
             self._forget(self.graph.declared)
@@ -116,7 +116,7 @@ class Lineage:
         return Status("stale", tuple(reasons), state.failed) if reasons or state.failed else Status("fresh")
 
     def made_at(self, name: str, key: str | None) -> int:
-        """Return when a partition was written (ns since 1970); 0 if it does not exist."""
+        """Return the time (ns since 1970) at which a partition was written; 0 if it does not exist."""
         stage = self.graph[name]
         path = _report_state(self._workspace, stage)
         if stage.table is not None:
@@ -124,7 +124,7 @@ class Lineage:
         return self._workspace.store.changed_ns(path)
 
     def blocked(self, name: str, key: str | None, *, current: bool) -> str:
-        """Return why a partition cannot be built, or empty; current: need fresh parents."""
+        """Return in words why a partition cannot be built, or empty; current: need fresh parents."""
         stage = self.graph[name]
         for parent, keys in self.graph.parents(name, key).items():
             if self.graph.source(parent) is not None:

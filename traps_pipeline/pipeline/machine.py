@@ -27,7 +27,7 @@ CLIPS = "mp4"  # the kind of a stage that renders
 
 
 def parts_of_run(context: dg.AssetExecutionContext, stage: Stage, plan: RunPlan) -> Parts:
-    """Return stages of a Dagster run that share a step's partitions, with wanted keys."""
+    """Return the wanted keys of each stage of a Dagster run whose partitions are those of this step."""
     keys = {str(key) for key in context.partition_keys} if stage.scheme else {None}
     asset_keys = context.run.asset_selection or context.job_def.asset_layer.executable_asset_keys
     names = {key.path[-1] for key in asset_keys}

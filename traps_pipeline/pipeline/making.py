@@ -30,7 +30,7 @@ class PartitionMaker:
         self._made_at: dict[str | None, int] = {}
 
     def make(self, inputs: Inputs) -> Iterator[tuple[str | None, StageOutput]]:
-        """Build a partition for each key of `inputs`, which must be read before any data."""
+        """Yield each key of `inputs` with its new partition; `inputs` must be read before any data."""
         if self._stage.side_by_side:
             yield from self._side_by_side([*inputs])
         elif self._stage.shared is None:

@@ -38,7 +38,7 @@ class StageChecks:
         self._failing: dict[tuple[str, str | None], Mapping[str, Any]] = {}
 
     def of_parents(self, lineage: Lineage, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate parents whose content was altered, before anything is built from them."""
+        """Yield failed evaluations of parents whose content was altered, before anything is built from them."""
         for parent, keys in self._graph.parents(self._stage.name, key).items():
             if self._graph.source(parent) is None:
                 for parent_key in keys:
@@ -46,7 +46,7 @@ class StageChecks:
                         yield from evaluations(self._history, parent, parent_key, {CURRENT: {"damaged": damage}})
 
     def test(self, key: str | None, output: StageOutput) -> Mapping[str, Mapping[str, Any]]:
-        """Test a partition just written by every check, and return what each finds wrong.
+        """Return by check what it finds wrong with a partition that was just written.
 
         Failures are stored before Dagster hears of the partition: a run that dies between the two makes it again.
         """
@@ -68,16 +68,16 @@ class StageChecks:
         return failures
 
     def of_made(self, key: str | None, found: Mapping[str, Mapping[str, Any]]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate every check of a partition, after its event, from what `test` found."""
+        """Yield the evaluation of every check of a partition, after its event, from what `test` returned."""
         self._failing |= {(check, key): failure for check, failure in found.items() if failure}
         yield from evaluations(self._history, self._stage.name, key, found)
 
     def of_unmade(self, key: str | None, error: TrapsError) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate a partition that could not be built."""
+        """Yield the evaluation of a partition that could not be built."""
         yield from self.of_made(key, {CURRENT: {"not made": str(error), REACHED: isinstance(error, BudgetReached)}})
 
     def of_fresh(self, key: str | None) -> Iterator[dg.AssetCheckEvaluation]:
-        """Evaluate the passing checks of a fresh partition, which this run does not build.
+        """Yield passing evaluations of a fresh partition, which this run does not build.
 
         Dagster awaits an evaluation from the run, and would say that the check was skipped, or failed to execute.
         """
@@ -86,7 +86,7 @@ class StageChecks:
         yield from evaluations(self._history, self._stage.name, key, {name: {} for name in sorted(names)})
 
     def still_failing(self, lineage: Lineage, seen: Collection[str | None]) -> Iterator[dg.AssetCheckEvaluation]:
-        """Re-evaluate failing checks of all keys; Dagster shows only the newest result."""
+        """Yield again the failed evaluations of all keys; Dagster shows only the newest result."""
         name = self._stage.name
         failed = self._workspace.failed_checks(name)
         for key in self._graph.keys(name):

@@ -18,7 +18,7 @@ SEPARATOR = "|"  # between the two dimensions of a key, as Dagster writes it
 
 @dataclass(frozen=True, eq=False)
 class Partitioning:
-    """A way to divide an asset into partitions: the names of its dimensions and their keys.
+    """A scheme that divides an asset into partitions: the names of its dimensions and their keys.
 
     dimensions: the keys of each dimension by its name, one or two, sorted by name. columns: returns the values of a
     table's partition columns for a key; wanted: returns a study's keys.
@@ -63,7 +63,7 @@ class KeyMapping(Protocol):
 
 @dataclass(frozen=True)
 class Every(KeyMapping):
-    """A dependency on all partitions of the upstream asset."""
+    """A mapping to all partitions of the upstream asset."""
 
     @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
@@ -72,7 +72,7 @@ class Every(KeyMapping):
 
 @dataclass(frozen=True)
 class SameKeys(KeyMapping):
-    """The partition of the same key."""
+    """A mapping to the upstream partition of the same key."""
 
     @override
     def above(self, key: str | None, below: Partitioning | None, above: Partitioning) -> Sequence[str]:
@@ -84,7 +84,7 @@ EVERY, SAME = Every(), SameKeys()
 
 @dataclass(frozen=True)
 class ByDimension(KeyMapping):
-    """Partitions that agree in one dimension; one side has only that, the other two."""
+    """A mapping to partitions that agree in one dimension; one side has only that, the other two."""
 
     name: str
 
@@ -99,7 +99,7 @@ class ByDimension(KeyMapping):
 
 @dataclass(frozen=True, eq=False)
 class Pairs(KeyMapping):
-    """Partitions listed one by one: the downstream keys of each parent partition."""
+    """A mapping listed key by key: the downstream keys of each upstream partition."""
 
     below: Mapping[str, Sequence[str]]
 
@@ -110,7 +110,7 @@ class Pairs(KeyMapping):
 
 @dataclass(frozen=True)
 class FixedKeys(KeyMapping):
-    """The same partitions of the parent for every key."""
+    """A mapping of every key to the same upstream partitions."""
 
     keys: Sequence[str]
 

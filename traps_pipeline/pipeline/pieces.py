@@ -1,4 +1,4 @@
-"""Cache the parts of an asset, and rebuild each only when its inputs change.
+"""Cache the parts of an asset (pages, files), and rebuild each only when its inputs change.
 
 The report is one page of a hundred tables, figures and pictures. Each is a piece: its content lies in an archive beside
 the asset's state, together with digests of its inputs.
@@ -21,7 +21,7 @@ NOTES = "inputs.json"  # archive member with the digests of each piece
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of an asset that one process builds while others build the rest.
+    """A part of an asset, such as a card of the report, that one process builds while others build the rest.
 
     reads: the stages and sources whose versions decide whether it is rebuilt.
     inputs: returns what it shows of them, as JSON; if their versions have changed, it is rebuilt only if this has, too.
@@ -36,7 +36,7 @@ class Piece:
 def make_pieces(
     workspace: Workspace, stage: str, code: str, pieces: Sequence[Piece]
 ) -> tuple[dict[str, bytes], list[str]]:
-    """Return all pieces' content, and names of those rebuilt for new inputs or code."""
+    """Return the content of all parts by name, and the names of those that were rebuilt."""
     path = workspace.reports / ".state" / f"{stage}.pieces.zip"
     previous_pieces = _read(workspace.store.here(path).read_bytes()) if workspace.store.has(path) else {}
     versions = Lineage(workspace).inputs(stage, None)

@@ -19,7 +19,7 @@ STUDY_URL = "/study"  # route of `traps ui` to the study's report, site and clip
 
 @dataclass(frozen=True)
 class Markdown:
-    """Rendered text; use it for numbers and ids, never for text that a model wrote."""
+    """A text in Markdown for Dagster's pages, for numbers and ids, never for text that a model wrote."""
 
     text: str
 
@@ -40,12 +40,12 @@ class StudyFile:
 
     @property
     def url(self) -> str:
-        """Its address on the server of `traps ui`."""
+        """The file's address on the server of `traps ui`."""
         return f"{STUDY_URL}/{quote(self.path)}" + (f"#{self.view}" if self.view else "")
 
 
 def rows_shown(frame: pd.DataFrame) -> Markdown | str:
-    """Return the first rows as Markdown; never use it for text that a model wrote."""
+    """Return the first rows as a Markdown table; never use it for text that a model wrote."""
     if frame.empty:
         return "not run"
     lines = [[*map(str, frame.columns)], ["---"] * len(frame.columns)]

@@ -16,7 +16,7 @@ Range = tuple[str | None, str | None]  # first and last key
 
 @dataclass(frozen=True)
 class Grid:
-    """A scheme's keys as cells of two dimensions, with a single row for one dimension."""
+    """The partition keys of a scheme in rows and columns: one for each dimension, or a single row."""
 
     rows: Sequence[str]
     columns: Sequence[str]

@@ -57,8 +57,8 @@ def dagster_history(workspace: Workspace) -> Iterator[dg.DagsterInstance]:
         else:
             raise
         raise TrapsError(
-            f"{dagster_home}: Dagster's history cannot be read or written ({reason}); {hint} and run the same command "
-            "again: tables are whole, no answer is lost"
+            f"{getattr(error, 'filename', None) or dagster_home}: Dagster's history cannot be read or written "
+            f"({reason}); {hint} and run the same command again: tables are whole, no answer is lost"
         ) from error
 
 

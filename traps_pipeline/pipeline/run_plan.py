@@ -33,7 +33,7 @@ Recorded = Callable[[str], Mapping[str | None, str | None]]  # a stage's version
 
 @dataclass(frozen=True)
 class StageStatus:
-    """A stage's partitions (or itself, by its name): fresh (their number), stale (with reasons), missing."""
+    """A stage's partitions (or itself, by its name): how many are fresh, which are stale (why) or missing."""
 
     stage: str
     fresh: int
@@ -71,17 +71,17 @@ class RunReport:
     tallies: Mapping[str, Tally] = field(default_factory=dict)
 
     def tally(self, stage: str) -> Tally:
-        """Return the work of one stage."""
+        """Return the counted work (calls, frames, rows) of one stage."""
         return self.tallies.get(stage, Tally())
 
     @property
     def frames(self) -> int:
-        """How many frames the run rendered."""
+        """The number of frames that the run rendered."""
         return sum(tally.frames for tally in self.tallies.values())
 
 
 class RunPlan:
-    """The partitions of a study or of one experiment that a run makes, by a snapshot of what is there.
+    """The partitions of a study, or of one experiment, that a run makes, from one snapshot of the workspace.
 
     stages: their names; all by default.
     """
@@ -106,7 +106,7 @@ class RunPlan:
         return plan
 
     def blocks(self) -> list[list[Stage]]:
-        """Return the stages that want anything, in order, in blocks that one run can materialize."""
+        """Return the stages that want anything, in order, in groups that one Dagster run can materialize."""
         return self.graph.blocks([name for name, keys in self.parts.items() if keys])
 
     def statuses(self) -> Iterator[StageStatus]:
@@ -144,7 +144,7 @@ class RunPlan:
         return stages, [key for key in self.graph.keys(stages[0].name) if key in keys] if stages else []
 
     def renew(self, stages: Iterable[Stage]) -> None:
-        """Look again at stages that were built since, and at all below them."""
+        """Look up anew the stages that were built since, and all stages downstream of them."""
         if self.workspace.is_shared:  # other hosts build beside this one
             self.lineage = Lineage(self.workspace)
         for stage in stages:
@@ -152,7 +152,7 @@ class RunPlan:
 
     @contextmanager
     def in_progress(self) -> Iterator[None]:
-        """Hand this plan on to the steps that this process executes meanwhile."""
+        """Give this plan, within the block, to the steps that this process executes."""
         before = IN_PROGRESS.set(self)
         try:
             yield

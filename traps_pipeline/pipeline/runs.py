@@ -38,7 +38,7 @@ _QUIET = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
 
 @dataclass
 class RunOutcome:
-    """A run's problems, one sentence each, and whether a budget was reached."""
+    """The outcome of a Dagster run: its problems, one sentence each, and whether a budget was reached."""
 
     problems: list[str]
     over_budget: bool
@@ -57,7 +57,7 @@ class Runs(ABC):
 
 
 class LocalRuns(Runs):
-    """Runs of the job of all assets in this process; parent: the run that starts them."""
+    """Executes runs of the job of all assets in this process; parent: the run that starts them."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class LocalRuns(Runs):
         failures = [event for event in result.all_events if event.is_step_failure]
         if any(error.cls_name in _INTERRUPTS for event in failures for error in _causes(event)):
             raise KeyboardInterrupt
-        outcome = problems_of(failures)
+        outcome = failed_outcome(failures)
         if not result.success and not outcome.problems:
             names = ", ".join(stage.name for stage in stages)
             outcome.problems.append(f"{names} {key or ''}: the run failed; see its log in Dagster")
@@ -159,7 +159,7 @@ def report_canceling(instance: dg.DagsterInstance, run_id: str) -> None:
 
 
 def range_tags(keys: Range, *, always: bool = False) -> dict[str, str]:
-    """Return a range's tags; a single key has none unless `always`."""
+    """Return the Dagster tags of a range of keys; a single key has none unless `always`."""
     first, last = keys
     if first is None or (first == last and not always):
         return {}
@@ -167,19 +167,19 @@ def range_tags(keys: Range, *, always: bool = False) -> dict[str, str]:
 
 
 def keys_of(stage: Stage, tags: Mapping[str, str]) -> Sequence[str]:
-    """Return a stage's partitions by `range_tags`, or by Dagster's tag of a single key."""
+    """Return the partition keys of a stage that a run's tags name."""
     first, last = (tags.get(name, tags.get("dagster/partition", "")) for name in _RANGE)
     return stage.scheme.between(first, last) if stage.scheme and first else []
 
 
 def this_host() -> str:
-    """Return the scope in which process ids are unique: host and PID namespace."""
+    """Return a text for the scope in which process ids are unique: host and PID namespace."""
     namespace = Path("/proc/self/ns/pid")
     return f"{socket.gethostname()} {namespace.readlink() if namespace.exists() else ''}".strip()
 
 
-def problems_of(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
-    """Return the messages of failed steps."""
+def failed_outcome(failures: Sequence[dg.DagsterEvent]) -> RunOutcome:
+    """Return the outcome of a run with these failed steps: their messages, and whether a budget was reached."""
     problems = [line for event in failures for line in reason(event.step_failure_data.error).splitlines()]
     over = any(error.cls_name == BudgetReached.__name__ for event in failures for error in _causes(event))
     return RunOutcome(problems, over)
@@ -207,7 +207,7 @@ def _chain(error: Any) -> list[Any]:
 
 
 def reason(error: Any) -> str:
-    """Return a Dagster error's message: our own sentence, else its innermost cause."""
+    """Return the message of a Dagster error: our own sentence, else its innermost cause."""
     chain = _chain(error)
     readable = [link for link in chain if link.cls_name in _SENTENCES]
     if not readable:

@@ -63,11 +63,11 @@ by_steering = ByDimension("steering")
 
 
 def to_keys(above: Partitioning, below: Partitioning, mapping: Callable[[str], Iterable[str]]) -> Pairs:
-    """Return each upstream partition's downstream keys that the study has."""
+    """Return the mapping of each upstream partition to the downstream keys that the study has."""
     pairs = {key: sorted(below.known & {*mapping(key)}) for key in sorted(above.known)}
     return Pairs({key: keys for key, keys in pairs.items() if keys})
 
 
 def these_keys(above: Partitioning, keys: Iterable[str]) -> FixedKeys:
-    """Return the upstream partitions among these keys that the study has."""
+    """Return the mapping of every partition to those of these upstream keys that the study has."""
     return FixedKeys([key for key in keys if key in above.known])

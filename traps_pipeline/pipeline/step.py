@@ -197,7 +197,7 @@ class _Step:
 
 
 def guard_events(events: Events, context: dg.AssetExecutionContext) -> Events:
-    """Forward a step's events; log progress, and keep keys out of stored tracebacks."""
+    """Yield the events of a step; log its progress, and keep keys out of stored tracebacks."""
     report = progress.current()
     try:
         with report.reporting_to(lambda line: context.log.info(page_text(line))):

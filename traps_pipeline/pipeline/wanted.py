@@ -1,4 +1,4 @@
-"""Compute the wanted partitions, which a study's experiments ask of its scenarios.
+"""Compute the partitions that a study's experiments want of its scenarios.
 
 Partition keys, `traps run`, `traps status`, Dagster's buttons and its automation all use this module, so nothing asks a
 model that no experiment of the study names.
@@ -32,7 +32,7 @@ from traps_pipeline.storage.workspace import Workspace
 
 
 class StudyPartitions:
-    """The wanted keys of every kind of partition, in key order.
+    """The wanted partition keys of every asset of a study, in key order.
 
     workspace: None for everything in the registry. experiment: limit the keys to this experiment of the study.
     """
@@ -48,13 +48,13 @@ class StudyPartitions:
             self._asked = [e for name, e in workspace.study.experiments.items() if experiment in (None, name)]
 
     def of(self, experiment: str | None) -> StudyPartitions:
-        """Return the keys of one experiment of the study; None: of all."""
+        """Return the wanted keys of one experiment of the study; None: of all."""
         is_all = experiment is None or self._workspace is None or [*self._workspace.study.experiments] == [experiment]
         return self if is_all else StudyPartitions(self._workspace, experiment)
 
     @cached_property
     def categories(self) -> list[str]:
-        """Categories with scenarios, or with a table made before all were discarded."""
+        """The names of categories with scenarios, or with a table made before all these were discarded."""
         if self._workspace is None:
             return [*CATEGORIES]
         existing = {part["category"] for part in self._workspace.tables.partitions(SCENE_SPECS)}
@@ -69,12 +69,12 @@ class StudyPartitions:
 
     @cached_property
     def datasets(self) -> list[str]:
-        """Datasets that have scenarios and are asked for."""
+        """The names of the datasets that have scenarios and that experiments ask."""
         return self._datasets(self._asked)
 
     @cached_property
     def arms(self) -> list[str]:
-        """The arms and variations among `datasets`."""
+        """The names of the arms and variations among `datasets`."""
         return [dataset for dataset in self.datasets if dataset in UNPAIRED]
 
     @cached_property
@@ -96,7 +96,7 @@ class StudyPartitions:
 
     @cached_property
     def cells(self) -> list[str]:
-        """Keys of the requested cells."""
+        """The keys of the requested cells: a dataset, and a model under a regime in a run."""
         asked_cells = {
             Cell(dataset, evaluation).key
             for experiment in self._asked
@@ -145,7 +145,7 @@ class StudyPartitions:
 
     @cached_property
     def probed(self) -> list[str]:
-        """Datasets whose hidden states are extracted."""
+        """The names of the datasets whose hidden states are extracted."""
         datasets = self._mechanism[0] if self._mechanism else []
         asked_datasets = self._datasets(experiment for experiment in self._asked if experiment.mechanism)
         existing = {*datasets, *(arm for arm in PROBED_ARMS if self._mechanism and arm in asked_datasets)}
@@ -171,20 +171,20 @@ class StudyPartitions:
 
     @cached_property
     def states(self) -> list[str]:
-        """Keys of hidden_states; datasets that are no pairs serve only probes."""
+        """The keys of hidden_states; datasets that are no pairs serve only probes."""
         cells = [StatesCell(d, e) for d, e in product(self.probed, self.extractions)]
         read = {d: (GUIDED if d == TWO_EVENTS else PROBE_PROMPT, *RANDOM_WEIGHTS) for d in self.probed}
         return [c.key for c in cells if c.dataset in DATASETS or c.extraction.prompt in read[c.dataset]]
 
     @cached_property
     def probed_prompts(self) -> tuple[str, ...]:
-        """VQA prompts whose states probes are fitted on, and extractions of random weights."""
+        """The names of VQA prompts whose states probes are fitted on, and of extractions of random weights."""
         settings = self._mechanism[1] if self._mechanism else None
         return (*(settings.probes.prompts if settings else (PROBE_PROMPT,)), *RANDOM_WEIGHTS)
 
     @cached_property
     def steered(self) -> list[str]:
-        """`model__directionregime__inferenceregime` of every steered evaluation."""
+        """The keys `model__directionregime__inferenceregime` of every steered evaluation."""
         if self._mechanism is None or not self.steers:
             return []
         settings = self._mechanism[1]
@@ -197,13 +197,13 @@ class StudyPartitions:
 
     @cached_property
     def steering(self) -> list[str]:
-        """Keys of the steering cells."""
+        """The keys of the steering cells."""
         datasets = self._mechanism[0] if self._mechanism else []
         return [SteeringCell.parse(f"{dataset}|{run}").key for dataset, run in product(datasets, self.steered)]
 
 
 def evaluations_of(experiment: Asked) -> list[Evaluation]:
-    """Return evaluations of named runs (default: all) that a model's run count allows."""
+    """Return an experiment's models under its regimes in its runs (default: all that a model has)."""
     evaluations = []
     for model in experiment.models:
         available = range(1, get_model(model).runs + 1)

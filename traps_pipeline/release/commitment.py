@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import platform
 import secrets
+from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,15 +26,26 @@ from traps_pipeline.base.terminal import plain
 from traps_pipeline.base.workers import keep_workers
 from traps_pipeline.base.yamlfile import faults_of, read_lines
 from traps_pipeline.benchmark.held_out import require_secret_seed
-from traps_pipeline.benchmark.records import load_release, load_released, parse_record, refuse_recorded
+from traps_pipeline.benchmark.records import (
+    load_release,
+    load_released,
+    parse_record,
+    parse_two_events,
+    refuse_recorded,
+    two_events_lines,
+)
+from traps_pipeline.scenes.draw.draw_lanes import difficulty_of, sample_two_events
 from traps_pipeline.scenes.draw.sample import load_tallies, sample_family
 from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.scenes.worlds.spec import SceneSpec, load_trajectory
 
 _HEX = r"^[0-9a-f]{64}$"
 # Fields of a record that depend on arithmetic: another CPU or simulator version may draw the same scene differently.
-_OF_ARITHMETIC = ("evidence", "trajectory_sha256", "twin", "control")
+_OF_ARITHMETIC = dict.fromkeys(("evidence", "trajectory_sha256", "twin", "control"), True)
+_OF_LANES: dict[str, Any] = {"camera": True, "lanes": {"__all__": {"lane", "layout", "twin"}}}
 _LIBRARIES = ("mujoco", "numpy")
+Specs = Mapping[str, SceneSpec | TwoEventsSpec]
 
 
 class _Strict(BaseModel):
@@ -42,9 +55,9 @@ class _Strict(BaseModel):
 class Commitment(_Strict):
     """The public file that commits to held-out scenarios before they are released.
 
-    draws: scenarios by family. look: the varied parts of the look, by family. difficulty: settings of every scene.
-    seed: digest of the seed. specs: digest of each record. made_with: machine and libraries, which may affect the
-    arithmetic of a draw.
+    draws, two_events: pairs, and scenarios of two events, by family. look: the varied parts of the look, by family.
+    difficulty: settings of every scene. seed: digest of the seed. specs: digest of each record. made_with: machine and
+    libraries, which may affect the arithmetic of a draw.
     """
 
     format: Literal[1] = 1
@@ -52,6 +65,7 @@ class Commitment(_Strict):
     version: str
     canary: str
     draws: dict[str, int]
+    two_events: dict[str, int] = {}
     look: dict[str, list[str]] = {}
     difficulty: Difficulty = DEFAULT_DIFFICULTY
     seed: str = Field(pattern=_HEX)
@@ -67,11 +81,11 @@ class Reveal(_Strict):
     nonce: str = Field(pattern=_HEX)
 
 
-def _seal_seed(reveal: Reveal, draws: Mapping[str, int]) -> str:
-    return digest(["seed", reveal.nonce, reveal.seed, dict(draws)])
+def _seal_seed(reveal: Reveal, draws: Mapping[str, int], two_events: Mapping[str, int]) -> str:
+    return digest(["seed", reveal.nonce, reveal.seed, dict(draws), *([dict(two_events)] if two_events else [])])
 
 
-def _seal_spec(reveal: Reveal, spec: SceneSpec) -> str:
+def _seal_spec(reveal: Reveal, spec: SceneSpec | TwoEventsSpec) -> str:
     return digest(["spec", reveal.nonce, spec.scenario_id, spec.spec_hash])
 
 
@@ -86,28 +100,37 @@ def commit(benchmark: Path, commitment: Path, reveal: Path) -> Commitment:
             raise TrapsError(f"{path}: is there already, and a commitment is made once; name another file")
     refuse_recorded("traps benchmark commit", benchmark / "released")
     specs, tallies = load_released(benchmark / "released"), load_tallies(benchmark / "released")
+    lanes = _two_events(benchmark)
+    drawn_lanes = {(lane.seed, difficulty_of(lane.model_dump(mode="json"))) for lane in lanes.values()}
     draws_of = {(tally.seed, tally.difficulty) for tally in tallies.values()}
-    if len(draws_of) != 1 or {spec.family for spec in specs.values()} != {*tallies}:
+    draws_of |= {(seed, replace(difficulty, window_s=DEFAULT_DIFFICULTY.window_s)) for seed, difficulty in drawn_lanes}
+    if len(draws_of) != 1 or len(drawn_lanes) > 1 or {spec.family for spec in specs.values()} != {*tallies}:
         raise TrapsError(
             f"{benchmark}: is not one draw of one seed and difficulty; draw one with `traps benchmark sample` into a "
             "new folder"
         )
     require_secret_seed(benchmark)
-    ((seed, difficulty),) = draws_of
+    ((seed, difficulty),) = drawn_lanes or draws_of
     secret = Reveal(seed=seed, nonce=secrets.token_hex(32))
     release, draws = load_release(benchmark / "benchmark.yaml"), {n: t.wanted for n, t in sorted(tallies.items())}
+    two_events = dict(sorted(Counter(lane.family for lane in lanes.values()).items()))
     published = Commitment(
         **release.model_dump(include={"name", "version", "canary"}),
         draws=draws,
+        two_events=two_events,
         look={name: tally.look for name, tally in sorted(tallies.items())},
         difficulty=difficulty,
-        seed=_seal_seed(secret, draws),
-        specs={id_: _seal_spec(secret, spec) for id_, spec in sorted(specs.items())},
+        seed=_seal_seed(secret, draws, two_events),
+        specs={id_: _seal_spec(secret, spec) for id_, spec in sorted({**specs, **lanes}.items())},
         made_with=_arithmetic(),
     )
     write_text(reveal, secret.model_dump_json(indent=1) + "\n", private=True)
     write_text(commitment, published.model_dump_json(indent=1) + "\n")
     return published
+
+
+def _two_events(benchmark: Path) -> dict[str, TwoEventsSpec]:
+    return {id_: line.spec for id_, line in two_events_lines(benchmark / "two_events" / "released").items()}
 
 
 def _arithmetic() -> dict[str, str]:
@@ -138,23 +161,31 @@ def _read(kind: type[Any], path: Path) -> Any:
 # --- verification -----------------------------------------------------------------------------------------------------
 
 
-def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
+def revealed_specs(folder: Path) -> Specs:
     """Return a folder's records. Raises TrapsError, also for an altered trajectory."""
+    from traps_pipeline.benchmark.filmed_lanes import trajectories_of
     from traps_pipeline.benchmark.specs import spec_of
 
     if (folder / "scenarios.jsonl").is_file():
-        path, revealed = folder / "scenarios.jsonl", dict[str, SceneSpec]()
+        path, revealed = folder / "scenarios.jsonl", dict[str, SceneSpec | TwoEventsSpec]()
         for number, line in read_lines(path):
             try:
                 spec = spec_of(json.loads(line))
             except (ValueError, KeyError, TypeError) as error:
                 raise TrapsError(f"{path}:{number}: is no record ({plain(error)[:200]}); get it again") from error
             revealed[spec.scenario_id] = parse_record(spec.model_dump_json(), f"{path}:{number}")
+        path = folder / "two_events.jsonl"
+        for number, line in read_lines(path) if path.is_file() else ():
+            lane = parse_two_events(json.loads(line)["record"], f"{path}:{number}")
+            revealed[lane.scenario_id] = lane
         return revealed
-    specs = load_released(folder / "released")
+    specs = {**load_released(folder / "released"), **_two_events(folder)}
     for spec in specs.values():
         path = folder / "released" / "trajectories" / f"{spec.scenario_id}.npz"
         try:
+            if isinstance(spec, TwoEventsSpec):
+                trajectories_of(spec, folder / "two_events" / path.relative_to(folder))
+                continue
             load_trajectory(path, spec.trajectory_sha256)
             load_trajectory(path, spec.twin.trajectory_sha256, "twin")
         except ValueError as error:
@@ -162,10 +193,10 @@ def revealed_specs(folder: Path) -> dict[str, SceneSpec]:
     return specs
 
 
-def broken_seals(commitment: Commitment, reveal: Reveal, specs: Mapping[str, SceneSpec]) -> list[str]:
+def broken_seals(commitment: Commitment, reveal: Reveal, specs: Specs) -> list[str]:
     """Return how records differ from the commitment, one sentence each, seed first."""
     problems = []
-    if _seal_seed(reveal, commitment.draws) != commitment.seed:
+    if _seal_seed(reveal, commitment.draws, commitment.two_events) != commitment.seed:
         problems.append("the revealed seed, number or composition is not the one that was committed")
     for id_ in sorted({*commitment.specs, *specs}):
         if id_ not in specs:
@@ -183,10 +214,15 @@ def redraw_records(
     *,
     workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
-) -> dict[str, SceneSpec]:
+) -> Specs:
     """Redraw the revealed seed's records. Raises TrapsError for an unfillable family."""
     with TemporaryDirectory(prefix="traps-") as folder:
+        of_pairs = replace(commitment.difficulty, window_s=DEFAULT_DIFFICULTY.window_s)
         with keep_workers():
+            for family, count in commitment.two_events.items():
+                report(f"drawing {count} of two events of {family} again")
+                drawn = ([family], count, reveal.seed, Path(folder) / "two_events" / "released", commitment.difficulty)
+                sample_two_events(*drawn, workers=workers, report=report)
             for family, count in commitment.draws.items():
                 report(f"drawing {count} of {family} again")
                 try:
@@ -196,7 +232,7 @@ def redraw_records(
                         reveal.seed,
                         Path(folder) / "released",
                         look=commitment.look.get(family, ()),
-                        difficulty=commitment.difficulty,
+                        difficulty=of_pairs,
                         workers=workers,
                         report=report,
                     )
@@ -204,15 +240,16 @@ def redraw_records(
                     raise TrapsError(
                         f"{family}: the seed does not give {count} scenarios here ({plain(error)})"
                     ) from error
-        return load_released(Path(folder) / "released")
+        return {**load_released(Path(folder) / "released"), **_two_events(Path(folder))}
 
 
-def is_same_scene(spec: SceneSpec, other: SceneSpec) -> bool:
+def is_same_scene(spec: SceneSpec | TwoEventsSpec, other: SceneSpec | TwoEventsSpec) -> bool:
     """Return whether records differ only in fields that depend on machine arithmetic."""
-    return spec.model_dump(exclude={*_OF_ARITHMETIC}) == other.model_dump(exclude={*_OF_ARITHMETIC})
+    excluded = _OF_ARITHMETIC | (_OF_LANES if isinstance(spec, TwoEventsSpec) else {})
+    return spec.model_dump(exclude=excluded) == other.model_dump(exclude=excluded)
 
 
-def arithmetic_differences(commitment: Commitment) -> str:
+def environment_differences(commitment: Commitment) -> str:
     """Return how machine and libraries differ from the commitment's, if they do."""
     own_machine = _arithmetic()
     names = [name for name in own_machine if commitment.made_with.get(name) != own_machine[name]]

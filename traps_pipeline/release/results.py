@@ -61,11 +61,11 @@ def write_results(workspace: Workspace, target: Path, dataset: str, who: Attribu
     overall = board.loc[(board["dataset"] == "overall") & board["pecs"].notna()]
     if overall.empty:
         raise TrapsError(f"{workspace.root}: no model has all four datasets yet; run the experiment first")
-    times = current_rows(workspace, RESPONSES, ["item_id", "model", "created_at"]).groupby("model")["created_at"].max()
+    asked: Any = current_rows(workspace, RESPONSES, ["item_id", "model", "created_at"]).groupby("model")
     files = []
     for model, rows in overall.groupby("model", sort=True):
         entries = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
-        evaluated_at = times[str(model)]
+        evaluated_at = asked["created_at"].max()[str(model)]
         hub = [_hub_entry(row, dataset, evaluated_at) for row in entries]
         files.append(f"{HUB}/{model}.yaml")
         write_text(target / files[-1], yaml.safe_dump(hub, sort_keys=False, allow_unicode=True))

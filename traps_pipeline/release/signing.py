@@ -33,7 +33,7 @@ def sign(folder: Path, private_key: Path) -> Path:
     return path
 
 
-def check_signature(folder: Path, public_key: Path) -> str:
+def signature_problem(folder: Path, public_key: Path) -> str:
     """Return what is wrong with a signature, if anything. Raises TrapsError."""
     library, path = _library(), folder / SIGNATURE
     if not path.is_file():

@@ -237,13 +237,13 @@ def _frame(path: Path, file: str, content: bytes) -> pd.DataFrame:
 
 def _with_bounded_texts(path: Path, file: str, parquet: pq.ParquetFile) -> pa.Table:
     """Return a table, its texts as dictionaries that store one of many rows once. Raises TrapsError for large texts."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
+    import pyarrow.compute
 
+    pc: Any = pyarrow.compute  # it creates its functions on import, invisible to type checkers
     data, longest, total = parquet.read(), 0, 0
     for column in data.columns:
-        texts = pc.list_flatten(column) if pa.types.is_list(column.type) else column
-        for chunk in texts.chunks if pa.types.is_dictionary(texts.type) else ():
+        texts = pc.list_flatten(column) if pyarrow.types.is_list(column.type) else column
+        for chunk in texts.chunks if pyarrow.types.is_dictionary(texts.type) else ():
             sizes = pc.binary_length(chunk.dictionary).take(chunk.indices)
             longest, total = max(longest, pc.max(sizes).as_py() or 0), total + (pc.sum(sizes).as_py() or 0)
     if longest > MAX_TEXT_BYTES or total > MAX_TABLE_BYTES:

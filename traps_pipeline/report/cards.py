@@ -40,7 +40,7 @@ LinkOf = Callable[[SourceItems], str]
 
 @dataclass(frozen=True)
 class Card:
-    """A part of the page, with the paper's counterpart.
+    """A section of the report page: the study's tables, figure or picture, beside the paper's.
 
     It holds the study's tables or figures (`html`, escaped), or `why` it was not run.
 
@@ -56,7 +56,7 @@ class Card:
 
     @classmethod
     def read(cls, data: bytes) -> Card:
-        """Read a report card from its JSON."""
+        """Return the report card that `data` stores as JSON."""
         return cls(**json.loads(data))
 
     @property
@@ -66,7 +66,7 @@ class Card:
 
 
 class Sources:
-    """The results of a study and of the paper, loaded on first use."""
+    """The results of a study and of the paper, each read when it is first used."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
@@ -84,7 +84,7 @@ class Sources:
 
 @lru_cache(4096)  # cells of one row share it, and so do tables
 def explorer_address(behind: SourceItems) -> str:
-    """Return the address of the explorer's view of the answers behind a number."""
+    """Return the URL, relative to the report, of the explorer's view of the answers behind a number."""
     return f"{EXPLORER}#{answers_view(**vars(behind))}"
 
 
@@ -161,7 +161,7 @@ def _failure(what: str, sources: Sources, error: Exception) -> str:
 
 
 def picture_card(picture: Picture, shows: str) -> Card:
-    """Return the card of a picture of clips, and what it says below."""
+    """Return the card of a picture made of clips' frames. shows: its caption."""
     try:
         pictures = {"": _picture(picture.name, picture.figure(), "webp")}
     except NotRun as reason:

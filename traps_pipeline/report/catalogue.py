@@ -41,7 +41,7 @@ CLAIM_STAGES = (
 
 @dataclass(frozen=True)
 class TableReport:
-    """A table (or several that belong together).
+    """A table of the report, or several that belong together: name, and the function that makes it.
 
     function: makes it (module.function of `report.tables`); reads: the stages whose tables it uses; paper:
     whether the paper has tables of this kind (`report.printed_tables`); recomputed: the names of its tables that `make`
@@ -67,11 +67,11 @@ class TableReport:
 
     @property
     def published(self) -> bool:
-        """Whether the paper prints a table of this name."""
+        """Whether the paper prints this table, or numbers from which it is recomputed."""
         return self.paper or bool(self.recomputed)
 
     def tables(self, results: Results) -> list[PrintedTable]:
-        """Return the tables, cached; of the paper, those recomputed without empty columns."""
+        """Return a study's tables, cached; of the paper, those recomputed from it, without empty columns."""
         if self.name not in results.kept:
             results.kept[self.name] = self._tables(results)
         return results.kept[self.name]
@@ -87,13 +87,13 @@ class TableReport:
         return [table for table in tables if results.is_study or table.name in self.recomputed]
 
     def as_printed(self) -> list[PrintedTable]:
-        """Return the paper's tables as printed, with numbers that only its text states."""
+        """Return the paper's tables as it prints them, and a table of numbers that only its text states."""
         from traps_pipeline.report.printed_tables import paper_tables
 
         return paper_tables(self.name)
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return files by path; the paper's are in `tables/published` and `recomputed`."""
+        """Return the tables' files, content by path; the paper's are in `tables/published` and `recomputed`."""
         from traps_pipeline.report.writing import table_files
 
         if results.is_study:
@@ -141,13 +141,13 @@ class FigureReport:
         return f"{self.finding(results)} {self.doc}".strip()
 
     def inputs(self, results: Results) -> list[str]:
-        """Return the frames that it draws, with refusals, judges and certificates, as text."""
+        """Return as texts all that the figure depends on: its frames' rows, refusals, judges, certificates."""
         frames: list[pd.DataFrame] = [getattr(results, name) for name in self.frames]
         said = [repr(results.refused), results.judged_by, results.certified]
         return [repr(rows.to_dict("split")) for rows in frames] + said
 
     def files(self, results: Results) -> dict[str, bytes]:
-        """Return PDF, SVG and PNG by path; empty if the figure was not run."""
+        """Return the figure as PDF, SVG and PNG files, content by path; empty if its data were not computed."""
         from traps_pipeline.report.writing import NotRun, figure_files
 
         try:

@@ -25,7 +25,7 @@ FOOTER_IN = 0.2  # pixels for the times below a pair's frames
 
 @dataclass(frozen=True)
 class Layout:
-    """Widths (inches) and texts of a pair.
+    """The layout of a drawn pair: widths and heights in inches, size and length of its texts.
 
     The defaults fit the width of a printed page, on which no text may be smaller than 6 points. header: room for the
     words above its frames; letters: letters of a question per line; questions: maximum lines of each question; ids:
@@ -54,7 +54,7 @@ PAGE = Layout()
 
 @dataclass(frozen=True)
 class SampledClip:
-    """Frames (moments, H, W, 3) uint8; from index `known` on, after the clip's end."""
+    """A clip's frames at the drawn times, (moments, H, W, 3) uint8; from index `known` on, after its end."""
 
     frames: np.ndarray
     known: int
@@ -112,7 +112,7 @@ def whole_pairs(items: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledClip, SampledClip, np.ndarray]:
-    """Return control, void and the control's informative times (moments,) in seconds."""
+    """Return a pair's control and void, sampled at the control's informative times, and these times (s)."""
     control, times_s = decode(root / str(pair.at["control", "clip"]))
     void, void_at = decode(root / str(pair.at["void", "clip"]))
     times = telling_times(control, times_s, moments)
@@ -120,7 +120,7 @@ def moments_of(pair: pd.DataFrame, root: Path, moments: int) -> tuple[SampledCli
 
 
 def telling_times(frames: np.ndarray, at: np.ndarray, moments: int) -> np.ndarray:
-    """Return times (moments,) from the first to the last of a clip's times `at`.
+    """Return the informative ones (moments,) of a clip's times `at`: evenly spread while its scene is visible.
 
     If an occluder closes the clip (frames, RGB), the last one is just before it, and of four or more the clip's last
     time is also included.

@@ -30,7 +30,7 @@ def _models(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 @_join_sentences
 def claims(results: Results) -> Iterator[str]:
-    """Yield which claims are held of a model, and which hold in a control too."""
+    """Yield sentences, by model: which claims hold of it, and which do not since they hold in a control too."""
     says = {claim.name: claim.says for claim in CLAIMS}
     for model, group in _models(claim_frame(results)):
         held = [says[name] for name in group.loc[group["verdict"] == "holds", "claim"]]
@@ -44,7 +44,7 @@ def claims(results: Results) -> Iterator[str]:
 
 @_join_sentences
 def leads(results: Results) -> Iterator[str]:
-    """Yield by how much states are ahead of the best rival on each dataset."""
+    """Yield a sentence per model: by how much probes of its hidden states beat the best rival, by dataset."""
     rows = lead_rows(results)
     for model, group in _models(rows.loc[rows["subject"] == MODEL]):
         parts = [
@@ -57,7 +57,7 @@ def leads(results: Results) -> Iterator[str]:
 
 @_join_sentences
 def patching(results: Results) -> Iterator[str]:
-    """Yield the positions with the largest effect at first and last layer."""
+    """Yield a sentence per model: the token positions with the largest effect at first and last layer."""
     rows = results.patching
     rows = rows.loc[(rows["source"] == "pair") & (rows["site"] == "residual") & rows["effect"].notna()]
     for model, group in _models(rows.loc[rows["group"] != "all"]):

@@ -112,7 +112,7 @@ def leaderboard_markdown(board: pd.DataFrame, two_way: pd.DataFrame | None = Non
 def leaderboards(
     board: pd.DataFrame, two_way: pd.DataFrame | None = None, notes: Sequence[str] = (), *, brief: bool = False
 ) -> list[PrintedTable]:
-    """Return each panel's tables of LEADERBOARD rows: ranking, then other datasets.
+    """Return the tables of LEADERBOARD rows, panel by panel: ranking, then the other datasets.
 
     The ranking is of `overall`, or the board's first dataset if no model has all four. An entry without a row comes
     last. notes: further notes of the first table. brief: only the first table of each panel, with fewer columns.
@@ -143,7 +143,7 @@ def _panel_tables(board: pd.DataFrame, two_way: pd.DataFrame | None, brief: bool
 
 
 def shortfall(board: pd.DataFrame) -> str:
-    """Return why models lack answers, and what to change, in a sentence; empty if none lacks a fifth of them."""
+    """Return a sentence on why models lack answers, and what to change; empty if none lacks a fifth of them."""
     rows = board.loc[board["dataset"] != "overall"]
     rows = rows.assign(asked=rows["n_items"].astype(int) * rows["n_runs"].astype(int))
     sums = rows.groupby("model", sort=False)[["asked", "n_missing"]].sum()
@@ -163,7 +163,7 @@ def shortfall(board: pd.DataFrame) -> str:
 
 
 def legend(board: pd.DataFrame, two_way: pd.DataFrame | None = None) -> dict[str, str]:
-    """Return the entries of LEGEND for the board's columns and marks."""
+    """Return the meaning, by term, of each column and mark that the leaderboard shows."""
     optional_terms = {column.heading: field for column, field in OPTIONAL.items()}
     optional_terms |= {INCOMPLETE_MARK: "incomplete", BROKEN_MARK: "is_broken"}
     unused_terms = {term for term, field in optional_terms.items() if not (board.loc[:, field].astype(float) > 0).any()}

@@ -1,4 +1,4 @@
-"""Keep the leaderboard as `traps run` prints it, for a run with nothing to do."""
+"""Store the leaderboard as `traps run` prints it, for a run with nothing to do."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def board_bytes(tables: Sequence[TextTable]) -> bytes:
     return json.dumps([asdict(table) for table in tables], ensure_ascii=False).encode()
 
 
-def printed_board(workspace: Workspace) -> str:
-    """Return a study's leaderboard for standard output, from a report that is fresh."""
+def stored_leaderboard_text(workspace: Workspace) -> str:
+    """Return a study's leaderboard for standard output, from its stored report or else its tables."""
     path = workspace.reports / BOARD_FILE
     if workspace.store.has(path):
         tables = [TextTable(**table) for table in json.loads(workspace.store.here(path).read_bytes())]
@@ -43,7 +43,7 @@ def _asked_earlier(workspace: Workspace) -> str:
 
 
 def board_tables(workspace: Workspace) -> list[TextTable]:
-    """Return the leaderboard from the tables, one per panel, and two events by themselves; none without either."""
+    """Return the study's leaderboard as texts: a table per panel, or that of two events alone; none without scores."""
     from traps_pipeline.people.human_score_rows import HUMAN_ROW, PANEL_ERRORS
     from traps_pipeline.people.recorded_certificates import certification_note
     from traps_pipeline.report.leaderboard_page import leaderboard_tables

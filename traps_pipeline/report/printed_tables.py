@@ -64,7 +64,7 @@ def _as_declared(file: str, declared: str) -> tuple[pd.DataFrame, list[Column]]:
 
 
 def titled_rows(file: str) -> pd.DataFrame:
-    """Return a file's rows with the titles of datasets, paths of directions and daggers."""
+    """Return the rows of a published file, with printed titles of datasets, paths and marks."""
     rows: pd.DataFrame = as_printed(file)
     if file.startswith("arranged_"):
         return rows
@@ -87,7 +87,7 @@ def numbers(names: Mapping[str, str]) -> list[Column]:
 
 @cache
 def audit_table() -> PrintedTable:
-    """Return statements that differ from the paper's tables, with line and arithmetic."""
+    """Return the table of the paper's statements that differ from its tables, with line and arithmetic."""
     from traps_pipeline.scoring.audit import DECLARED, DIFFERS, audit, counts_text  # pandas takes long to import
 
     findings = audit()

@@ -44,7 +44,7 @@ PAPER_CHAPTER = "paper"  # the chapter of the paper's cards, which use only `ass
 
 @dataclass(frozen=True)
 class Part:
-    """A card before it is built.
+    """A report card that is not built yet: its chapter, its name and the function that builds it.
 
     reads: its stages; inputs: returns what it shows of them, as JSON; null for all."""
 
@@ -108,7 +108,7 @@ def _contents(report: TableReport, study: Results) -> list[Any]:
 def report_files(
     study: Results, cards: Sequence[tuple[str, Card]], address: LinkOf | None = explorer_address
 ) -> dict[str, bytes]:
-    """Return report page and leaderboard (Markdown, JSON lines) by path, from cards."""
+    """Return the report page and the leaderboard (Markdown, JSON lines), content by path, from cards."""
     remarks = people_notes(study.human_row, study.panel_errors, study.certified)
     paper = {card.name: card.html for chapter, card in cards if chapter == PAPER_CHAPTER}
     figures, pictures, tables = (

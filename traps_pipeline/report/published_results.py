@@ -49,7 +49,7 @@ def _rates(results: Results) -> pd.DataFrame:
     means = {kind: (kind, "mean") for kind in ("visual", "textual")}
     pooled_rates = concat_frames(parts).groupby(["model", "epoch"], sort=False).agg(**means).reset_index()
     table = concat_frames([*parts, pooled_rates.assign(taxonomy="pooled")])
-    table["gap"] = analyses.ratio(table["textual"], table["visual"])
+    table["gap"] = analyses.divide_elementwise(table["textual"], table["visual"])
     return table.reindex(columns=pd.Index(RATE_COLUMNS))
 
 
@@ -62,7 +62,7 @@ def _sub_scenarios(results: Results) -> pd.DataFrame:
     table["abs_rec_uplift"] = table["guided_abs_rec"] - table["abs_rec"]
     table["guided_pecs"] = np.nan
     table["false_abs_uplift"] = table["guided_false_abs"] - table["false_abs"]
-    table["textual_over_visual"] = analyses.ratio(table["abs_rec_ill_posed"], table["abs_rec"])
+    table["textual_over_visual"] = analyses.divide_elementwise(table["abs_rec_ill_posed"], table["abs_rec"])
     return table.assign(epoch="original").reindex(columns=pd.Index(SUB_COLUMNS))
 
 

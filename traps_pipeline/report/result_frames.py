@@ -65,17 +65,17 @@ TEXTUAL_COLUMNS = ("ill_posed_n_models", "abs_rec_ill_posed", "textual_over_visu
 
 
 def no_rows(columns: Iterable[str]) -> cached_property[pd.DataFrame]:
-    """Return a frame with these columns and without rows."""
+    """Return an attribute that holds a frame with these columns and without rows."""
     return cached_property(lambda results: _empty_frame(columns))
 
 
 def table_frame(table: Table) -> cached_property[pd.DataFrame]:
-    """Return a frame that holds the rows of a table."""
+    """Return an attribute that holds a table's rows as a frame, read when it is first used."""
     return cached_property(lambda results: results.rows(table))
 
 
 class Results:
-    """One set of results; a frame has no rows if its part was not run.
+    """The results of a study or of the paper, as frames; a frame has no rows if its part was not run.
 
     A new frame is an attribute here, made when first read; kinds of results that have it override `no_rows`.
     """
@@ -145,7 +145,7 @@ class Results:
         self.refused: dict[str, list[str]] = {}
 
     def rows(self, table: Table) -> pd.DataFrame:
-        """Return all rows of a table of a study; for the paper, a frame without rows."""
+        """Return all rows of a study's table as a frame; for the paper, a frame without rows."""
         return _empty_frame(table.names)
 
     def refusal(self, dataset: str, left: tuple[str, str], right: tuple[str, str]) -> str | None:
@@ -159,7 +159,7 @@ class Results:
         return {(row["dataset"], pair): row["refused"] for row, pair in zip(rows, sides, strict=True)}
 
     def why(self, what: str) -> str:
-        """Return the reason, for people, why a frame has no rows."""
+        """Return in words why a frame of these results has no rows."""
         return "; ".join(self.refused.get(what, [])) or (
             "this study has no such results yet" if self.is_study else "the paper prints no such table"
         )
@@ -172,13 +172,13 @@ def _empty_frame(columns: Iterable[str]) -> pd.DataFrame:
 
 
 def datasets_of(cells: pd.DataFrame) -> list[str]:
-    """Return the datasets of the cells, in the benchmark's order."""
+    """Return the names of the datasets in the cells (rows of model, dataset, regime), in the benchmark's order."""
     names = set(cells["dataset"])
     return [name for name in DATASETS if name in names]
 
 
 def concat_frames(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """Return the concatenated parts; without parts, a frame without rows or columns."""
+    """Return one frame of all rows of the parts; without parts, a frame without rows or columns."""
     import pandas as pd
 
     return pd.concat([pd.DataFrame(), *parts], ignore_index=True)

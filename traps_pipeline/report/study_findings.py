@@ -26,7 +26,7 @@ REGIME_WORDS = {STANDARD: "Asked plainly (standard)", GUIDED: "Told not to guess
 
 @dataclass(frozen=True)
 class StudyFinding:
-    """A sentence, and the name of the card with its numbers."""
+    """A sentence about a study, and the name of the report card with its numbers."""
 
     text: str
     card: str

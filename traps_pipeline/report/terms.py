@@ -1,4 +1,4 @@
-"""Share titles, marks and sides between tables, figures and pages."""
+"""Share the printed titles and marks, and the names of a pair's sides, between tables, figures and pages."""
 
 from traps_pipeline.protocol.datasets import ARMS, GRADED, TWO_EVENTS, VARIATIONS
 from traps_pipeline.protocol.metric_words import METRIC_WORDS, SHARES

@@ -30,7 +30,7 @@ WORDS_IN, LETTERS, MAX_LINES = 3.1, 66, 6  # width of the text column beside the
 
 @dataclass(frozen=True)
 class Example:
-    """A pair (ITEMS rows indexed by side), a model, and lines beside its frames."""
+    """A pair (ITEMS rows indexed by side), the model that is shown, and the lines beside its frames."""
 
     pair: pd.DataFrame
     model: str
@@ -85,7 +85,7 @@ def chosen_example(verdicts: pd.DataFrame) -> dict[Any, Any] | None:
 
 
 def reading(answer: str, votes: Sequence[Mapping[Any, Any]], verdict: Mapping[Any, Any]) -> list[str]:
-    """Return the lines beside a side's frames: answer, judges' votes, and verdict."""
+    """Return three lines of text about a side (control or void): answer, judges' votes, and verdict."""
     valid = [vote for vote in votes if vote["valid"]]
     abstention_votes = [vote for vote in valid if vote["task"] == "abstention"]
     abstained = sum(bool(vote["abstained"]) for vote in abstention_votes)

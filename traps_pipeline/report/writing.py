@@ -56,7 +56,7 @@ class SourceItems:
 
 
 class NotRun(Exception):
-    """A figure has no data; the message gives the reason, for people."""
+    """Raised for a figure without data; the message gives the reason, for people."""
 
 
 Trace = Callable[[Mapping[str, Any], str], SourceItems | None]  # row and field -> the items behind that number
@@ -108,7 +108,7 @@ class Column:
 
     @property
     def is_number(self) -> bool:
-        """Whether values are aligned to the right."""
+        """Whether the column holds numbers, which are aligned to the right."""
         return self.unit != "text"
 
     def text(self, row: Mapping[str, Any]) -> str:
@@ -167,13 +167,13 @@ class PrintedTable:
 
     @cached_property
     def parts(self) -> list[list[tuple[str, str, str]]]:
-        """Text or number, spread and mark of each cell, as printed (rows, columns)."""
+        """The text or number, spread and mark of each cell, as printed: a list per row."""
         of_text = cache(plain)  # a column has few different texts
         return [[column.parts(row, of_text) for column in self.columns] for row in self.records]
 
     @cached_property
     def cells(self) -> list[list[str]]:
-        """Printed cells (rows, columns)."""
+        """The printed text of each cell: a list per row."""
         return [[*map(_joined, row)] for row in self.parts]
 
     @cached_property
@@ -187,7 +187,7 @@ class PrintedTable:
 
     @property
     def content(self) -> str:
-        """All that it prints, links and exports; equal content gives equal files."""
+        """A text of all that the table prints, links and exports; equal content gives equal files."""
         words = [getattr(self, field.name) for field in fields(self) if field.name not in ("rows", "trace")]
         return repr([*words, [*self.rows.columns], self.records])
 
@@ -211,7 +211,7 @@ class PrintedTable:
 
     @property
     def data(self) -> pd.DataFrame:
-        """The printed cells' numbers: columns and their spreads, then all other fields."""
+        """A frame of the printed cells' numbers: columns and their spreads, then all other fields."""
         import pandas as pd
 
         printed_fields = [field for column in self.columns for field in (column.field, column.spread) if field]
@@ -232,7 +232,7 @@ def table_files(table: PrintedTable) -> dict[str, bytes]:
 
 
 def table_markdown(table: PrintedTable) -> str:
-    """Return title, table, notes; texts escaped."""
+    """Return a table in Markdown with its title and notes; texts are escaped."""
     title = f"**{markdown(table.title)}.** {markdown(table.lead)}" if table.lead else f"**{markdown(table.title)}**"
     lines = [title, ""]
     if table.absence:
@@ -247,7 +247,7 @@ def table_markdown(table: PrintedTable) -> str:
 
 
 def table_text(table: PrintedTable) -> TextTable:
-    """Return title, table and notes for standard output."""
+    """Return a table with its title and notes as standard output prints it."""
     title = f"{table.title}. {table.lead}" if table.lead else table.title
     if table.absence:
         return TextTable(title, [], [], [], table.absence, table.remarks)
@@ -285,7 +285,7 @@ def table_latex(table: PrintedTable) -> str:
 
 
 def table_html(table: PrintedTable, address: Callable[[SourceItems], str] | None = None) -> str:
-    """Return a table in a scrolling box with notes; `address`: link to the items."""
+    """Return a table's HTML, in a scrolling box with notes; `address`: link to the items."""
 
     def link(row: Mapping[str, Any], column: Column, printed: str) -> str | None:
         is_known = column.is_number and printed not in ("", NONE)
@@ -328,7 +328,7 @@ def environment(folder: Path = TEMPLATES) -> jinja2.Environment:
 
 
 def markdown(text: object) -> str:
-    """Return the text escaped as neither HTML nor markup, within its table cell."""
+    """Return the text escaped for a Markdown table's cell: neither HTML nor markup acts in it."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~$])", r"\\\1", html.escape(plain(text), quote=False))
 
 

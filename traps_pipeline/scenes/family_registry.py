@@ -79,7 +79,7 @@ def family_digest(name: str) -> str:
 
 
 def added_digests() -> list[str]:
-    """Return the digests of all families that packages add, which decide clips and verdicts as code of ours does."""
+    """Return the digests of families that packages add, which decide clips and verdicts as our own code does."""
     return [family_digest(name) for name in sorted(plugins("families"))]
 
 

@@ -22,7 +22,7 @@ def family_asking(question: str) -> Family | None:
 
 
 def observe(clip: Path, question: str, policy: FramePolicy = SAMPLED) -> str | None:
-    """Return the observer's answer from frames (at 5 per second); None if unknown."""
+    """Return the answer that the observer reads from a clip's frames (5 per second); None if unknown."""
     strip, question = lane_asked(question) or (None, question)
     family = family_asking(question)
     if family is None or family.observe is None:

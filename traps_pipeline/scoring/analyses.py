@@ -42,7 +42,7 @@ _EQUAL = 12  # decimals at which two means count as equal: below any printed dig
 
 
 def study_cells(leaderboard: pd.DataFrame) -> pd.DataFrame:
-    """Return cells from LEADERBOARD rows, with `_std` over runs, n_pairs, n_runs etc."""
+    """Return the datasets' rows of LEADERBOARD: shares with deviations over runs (`_std`), and counts."""
     rows = null_single_deviations(leaderboard.loc[leaderboard["dataset"] != "overall"])
     spread = [f"{share}_std" for share in SHARES]
     columns = [*_ENTRY, "epoch", "n_pairs", "n_runs", "n_missing", "incomplete", *SHARES, *spread]
@@ -56,7 +56,7 @@ def null_single_deviations(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def scoped_cells(metrics: pd.DataFrame, scope: str) -> pd.DataFrame:
-    """Return cells by part of a dataset, from METRICS rows, averaged over runs.
+    """Return the metrics of parts of a dataset, averaged over runs, from METRICS rows.
 
     scope: `category`, `sub_scenario` or `label` (the control's answer in a sub-scenario). Columns as in `study_cells`,
     and `scope`, which names the part.
@@ -112,7 +112,7 @@ def uplift(cells: pd.DataFrame, means: pd.DataFrame | None = None) -> pd.DataFra
     rows = overall(cells) if means is None else means
     guided, standard = (rows[rows["regime"] == r].set_index("model")["abs_rec"] for r in (GUIDED, STANDARD))
     models = [model for model in rows["model"].unique() if model in guided.index and model in standard.index]
-    return pd.DataFrame({"model": models, "ratio": ratio(guided.loc[models], standard.loc[models])})
+    return pd.DataFrame({"model": models, "ratio": divide_elementwise(guided.loc[models], standard.loc[models])})
 
 
 def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
@@ -132,7 +132,7 @@ def spread(cells: pd.DataFrame, column: str = "pecs_std") -> pd.DataFrame:
 
 
 def frontier(means: pd.DataFrame) -> pd.DataFrame:
-    """Return rows not dominated in acc and j within their regime, by decreasing Acc.
+    """Return the rows that no other row dominates in acc and j within a regime, by decreasing Acc.
 
     A model dominates another if it is at least as good in both metrics and better in one. Two equal models are both on
     the frontier; a model without Acc or J is not on it.
@@ -162,13 +162,13 @@ def naive_gap(cells: pd.DataFrame, threshold: float = 0.03) -> pd.DataFrame:
 
 
 def zero_boundary(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return cells with PECS 0: in no run are Acc and J both above 0."""
+    """Return the cells with PECS 0, in which no run has both Acc and J above 0."""
     cells = _check(cells)
     return cells.loc[cells["pecs"] == 0].reset_index(drop=True)
 
 
 def degenerate_strategies() -> pd.DataFrame:
-    """Return expected metrics of strategies that do not discriminate.
+    """Return a frame of the expected metrics of strategies that do not discriminate.
 
     Columns strategy, acc, false_abs, abs_rec, j, pecs, naive. acc is null where the strategy does not determine it;
     PECS is still 0, since J is not above 0.
@@ -218,7 +218,7 @@ def visual_textual_gap(cells: pd.DataFrame, taxonomies: Sequence[str] = TAXONOMI
     means = pd.DataFrame(pooled.groupby(level=["model", "regime"]).mean())
     pooled = means.assign(taxonomy="pooled").reset_index()
     table = pd.concat([rates.reset_index(), pooled], ignore_index=True)
-    table["gap"] = ratio(table["textual"], table["visual"])
+    table["gap"] = divide_elementwise(table["textual"], table["visual"])
     models, places = list(cells["model"].unique()), (*TAXONOMIES, "pooled")
     keys = zip(table["regime"], table["model"], table["taxonomy"], strict=True)
     order = [(regime, models.index(model), places.index(taxonomy)) for regime, model, taxonomy in keys]
@@ -288,7 +288,7 @@ def sub_scenarios(cells: pd.DataFrame) -> pd.DataFrame:
         row |= guided[SHARES].mean().add_prefix("guided_").to_dict()
         row |= {f"{share}_uplift": change[share] for share in ("abs_rec", "false_abs")}
         means = [pd.Series([side.loc[common, "abs_rec"].mean()]) for side in (textual_voids, standard)]
-        row |= {"abs_rec_ill_posed": means[0][0], "textual_over_visual": float(ratio(*means)[0])}
+        row |= {"abs_rec_ill_posed": means[0][0], "textual_over_visual": float(divide_elementwise(*means)[0])}
         row["n_missing"] = sum(int(side["n_missing"].sum()) for side in (standard, guided, textual_voids.loc[common]))
         rows.append(row)
     return pd.DataFrame(rows)
@@ -326,8 +326,8 @@ def accuracy_by_label(cells: pd.DataFrame) -> pd.DataFrame:
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def ratio(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
-    """Divide elementwise: infinite where the denominator is 0, NaN where both are."""
+def divide_elementwise(numerator: pd.Series | pd.DataFrame, denominator: pd.Series | pd.DataFrame) -> np.ndarray:
+    """Return the quotients as an array: infinite where the denominator is 0, NaN where both are."""
     top, bottom = numerator.to_numpy(float), denominator.to_numpy(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return top / bottom

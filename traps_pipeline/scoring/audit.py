@@ -1,4 +1,4 @@
-"""Read the audit of the paper's tables: what other published values give for each statement (`traps results audit`).
+"""Read the audit of the paper's tables, which recomputes each statement from other published values.
 
 `python -m tools.paper_audit` recomputes `assets/published/audit.csv`: a row a statement, with the published and the
 recomputed value, a verdict (`agrees`, `within rounding`, `declared`, `differs`), the arithmetic and the line in the
@@ -20,12 +20,12 @@ _AGREEING = (AGREES, ROUNDING)
 
 
 def audit() -> pd.DataFrame:
-    """Return a row a statement: group, statement, published, recomputed, verdict, reason, line, all of them texts."""
+    """Return a frame with a row per statement of the paper: group, published, recomputed and other texts."""
     return as_printed("audit")
 
 
 def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return claims, differences and counts as text; everything: list the rest, too."""
+    """Return the claims, differences and counts as text. everything: list the other statements, too."""
     lines = ["lines are those of the paper's LaTeX source"]
     for group, rows in findings.groupby("group", sort=False):
         counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())

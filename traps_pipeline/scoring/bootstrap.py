@@ -30,7 +30,7 @@ _IN_MEAN = 0.5**0.5  # of two taxonomies: their errors are independent, so squar
 
 @dataclass(frozen=True)
 class ResampledMetrics:
-    """The mean over runs of every metric, observed and in every resample.
+    """Every metric, averaged over runs: as observed, and both of its bounds in every resample.
 
     entries: (model, regime, dataset or `overall`) of each row; observed: (entries, RESAMPLED_METRICS) float64; values:
     (entries, 2, RESAMPLED_METRICS, resamples) float32, lower ends before upper ends. NaN where nothing is decided, and
@@ -42,12 +42,12 @@ class ResampledMetrics:
     values: np.ndarray
 
     def metric(self, name: str) -> np.ndarray:
-        """Return the ends of one metric: (entries, 2, resamples)."""
+        """Return the lower and upper bounds of one metric in each resample, (entries, 2, resamples)."""
         return self.values[:, :, RESAMPLED_METRICS.index(name)]
 
 
 def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEED) -> ResampledMetrics:
-    """Resample every (model, regime) on each of its datasets, and overall.
+    """Return the resampled metrics of every (model, regime) on each of its datasets, and overall.
 
     Overall is the equal-weight mean over the four datasets, over the runs that have all four. Metrics are computed per
     run, then averaged.
@@ -78,7 +78,7 @@ def resample(verdicts: pd.DataFrame, resamples: int = RESAMPLES, seed: int = SEE
 
 
 def intervals(resampled: ResampledMetrics, level: float = _LEVEL) -> pd.DataFrame:
-    """Return 95 % intervals (ENTRY, INTERVAL_COLUMNS) by entry, null where undecided."""
+    """Return each entry's interval of this level in every metric, as a frame; null where nothing is decided."""
     ends = [
         interval(resampled.metric(name), resampled.observed[:, k], limits_of(name), level)
         for k, name in enumerate(RESAMPLED_METRICS)
@@ -96,7 +96,7 @@ def limits_of(metric: str) -> tuple[float, float]:
 def interval(
     ends: np.ndarray, observed: np.ndarray | float, limits: tuple[float, float], level: float = _LEVEL
 ) -> np.ndarray:
-    """Return intervals from resampled ends, (.., 2, resamples) -> (.., 2).
+    """Return the interval of bounds in resamples, (.., 2, resamples) -> (.., 2).
 
     Every interval of a score comes from here. It contains `observed` (..) and lies within the limits; a NaN among the
     resamples is left out, and the interval is NaN where all are.
@@ -108,18 +108,18 @@ def interval(
 
 
 def with_interval(name: str, ends: np.ndarray, limits: tuple[float, float]) -> dict[str, float]:
-    """Return score and interval as columns; ends: (2, 1 + resamples), observed first."""
+    """Return score and interval as columns; ends: bounds (2, 1 + resamples), the observed one first."""
     low, high = interval(ends[:, 1:], ends[1, 0], limits)
     return {name: float(ends[1, 0]), f"{name}_ci_low": float(low), f"{name}_ci_high": float(high)}
 
 
 def difference(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return ends of left - right, (.., 2, resamples): worst - best, best - worst."""
+    """Return the bounds of left - right, (.., 2, resamples), from those of both."""
     return left - right[..., ::-1, :]
 
 
 def quantile(draws: np.ndarray, q: float) -> np.ndarray:
-    """Return a quantile over the last axis, (.., n) -> (..), ignoring NaN.
+    """Return a quantile of values over the last axis, (.., n) -> (..), ignoring NaN.
 
     Equals `np.nanquantile`, which partitions each row several times; one sort takes a fifth of that.
     """
@@ -144,7 +144,7 @@ def scenario_weights(scenarios: int, resamples: int, seed: int | list[int]) -> n
 
 @dataclass(frozen=True)
 class Resampling:
-    """Weights of scenarios in every resample.
+    """The weight of each scenario in every resample.
 
     The first draw takes each scenario once and no unseen one, and so gives the metrics themselves. scenarios: by
     taxonomy its scenarios (n,) and their weights (1 + resamples, n) float32: exponential with mean 1, positive.
@@ -164,7 +164,7 @@ class Resampling:
 
 
 def draw_scenarios(items: pd.DataFrame, resamples: int, seed: int) -> Resampling:
-    """Draw the weights of the scenarios of items (columns scenario_id, taxonomy)."""
+    """Return random weights of the scenarios of items (columns scenario_id, taxonomy)."""
     scenario_weights_of = {}
     for k, taxonomy in enumerate(TAXONOMIES):
         ids = pd.Index(sorted(items.loc[items["taxonomy"] == taxonomy, "scenario_id"].unique()))
@@ -187,7 +187,7 @@ def resampled_sums(weights: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> np.ndarray:
-    """Append the unseen scenario's contribution to sums.
+    """Return sums extended by the contribution of a scenario that the sample lacks.
 
     (.., 2 x decisions, draws) -> (.., 3 x decisions, draws).
 
@@ -199,7 +199,7 @@ def with_unseen(sums: np.ndarray, scenarios: np.ndarray, unseen: np.ndarray) -> 
 
 
 def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
-    """Return the lower and upper ends of shares from sums of `with_unseen`.
+    """Return the lower and upper bounds of shares, from sums of `with_unseen`.
 
     Of COUNTS these are Acc, FalseAbs and AbsRec: (.., 3 x decisions, resamples) -> (2, .., decisions, resamples); NaN
     where a denominator is 0. in_mean: whether the shares enter a mean over datasets or arms, where the unseen scenarios
@@ -213,7 +213,7 @@ def shares_of(sums: np.ndarray, in_mean: bool = False) -> np.ndarray:
 
 
 def ends_of_shares(counts: pd.DataFrame, resampling: Resampling, named: str) -> np.ndarray:
-    """Return ends (2, decisions, 1 + resamples) of shares.
+    """Return the lower and upper bounds of shares in each resample, (2, decisions, 1 + resamples).
 
     counts: by scenario, how often each decision was yes and was made, in turn. named: as in `run_sums`.
     """
@@ -243,7 +243,7 @@ def metrics_of_shares(shares: np.ndarray) -> np.ndarray:
 
 
 def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tuple[str, int], np.ndarray]:
-    """Return sums of COUNTS and an unseen scenario (9, 1 + resamples) by dataset, run.
+    """Return the sums of COUNTS and an unseen scenario, (9, 1 + resamples), by dataset and run.
 
     group: the items of one model and regime. A dataset (an arm) may have items of both taxonomies. named: identifies
     the items' unseen scenarios.
@@ -275,7 +275,7 @@ def run_sums(group: pd.DataFrame, resampling: Resampling, named: str) -> dict[tu
 def means_over_runs(
     sums: Mapping[tuple[str, int], np.ndarray], compute: Callable[[np.ndarray, bool], np.ndarray], draws: int
 ) -> dict[str, np.ndarray]:
-    """Return dataset or `overall` -> mean over runs (2, RESAMPLED_METRICS, draws).
+    """Return the mean over runs (2, RESAMPLED_METRICS, draws) by dataset, `overall` included.
 
     sums: the `run_sums` of (dataset, run). compute: the function (`metrics_of`) that computes metrics from them.
     """

@@ -43,7 +43,7 @@ _Side = tuple[str, str]  # model, regime
 
 
 def contrasts(resampled: ResampledMetrics, metrics: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return CONTRASTS rows, from the bootstrap and the rows behind it.
+    """Return CONTRASTS rows: differences of models and of regimes, with intervals from the bootstrap.
 
     METRICS rows give the means, VERDICTS rows the items and epochs. The rows compare every pair of models under each
     regime and every pair of regimes of each model, in PECS and in J, on each dataset, and overall if both sides have a
@@ -80,7 +80,7 @@ def contrasts(resampled: ResampledMetrics, metrics: pd.DataFrame, verdicts: pd.D
 
 
 def version_contrasts(then: pd.DataFrame, now: pd.DataFrame, resamples: int = RESAMPLES) -> pd.DataFrame:
-    """Return the change between two studies (or versions) on their common pairs.
+    """Return the change of scores between two studies (or versions) on their common pairs.
 
     The change is now minus then; both are VERDICTS rows. A pair that is incomplete in either study, in the same run and
     cell, is left out. Columns: model, regime, dataset (and `overall`), metric, n_pairs per run, n_scenarios, then, now,

@@ -1,4 +1,4 @@
-"""Test how abstention changes as one property of the pairs changes by steps.
+"""Test how abstention changes as one property of the pairs changes step by step.
 
 See docs/hypotheses.md. Each hypothesis has doses; the first is the reference for the others, on the scenarios that both
 have. Beside every metric of a model stands the score of shortcut rules, which read one cue and understand nothing, and
@@ -50,7 +50,7 @@ _ITEM_COLUMNS = [
 
 @dataclass(frozen=True)
 class Dose:
-    """One dose of a hypothesis: a setting of a scene whose effect is measured.
+    """One step of a hypothesis: a setting of a scene whose effect is measured.
 
     datasets: where it is asked. side: None for both. counts_as: the sides that its items count as.
     """
@@ -274,7 +274,7 @@ def _best(rows: Iterable[Mapping[str, Any]], field: str, named: str) -> dict[str
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many rows break their definition; null is not wrong.
+    """Return the number of HYPOTHESES rows that break their definition; null is not wrong.
 
     A row is wrong if a share lies outside [0, 1], an interval is out of order, J is not AbsRec minus FalseAbs, or a
     change over all scenarios is not the difference of the two values.

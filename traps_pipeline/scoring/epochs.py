@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Origin(NamedTuple):
-    """Campaigns of a decision's answers and panels of its votes, each joined by +."""
+    """The campaigns of an answer and the panels of its votes, each joined by +."""
 
     epoch: str
     panel: str
@@ -26,7 +26,7 @@ Answered = Mapping[str, Origin]  # by item
 
 
 class EpochMismatch(TrapsError):
-    """The two sides of a ratio, contrast or gap were evaluated in different campaigns."""
+    """Raised where the two sides of a ratio, contrast or gap were evaluated in different campaigns."""
 
 
 def require_one_epoch(epochs: pd.DataFrame, metric: str) -> None:
@@ -49,7 +49,7 @@ def require_one_epoch(epochs: pd.DataFrame, metric: str) -> None:
 
 
 def answered_items(verdicts: pd.DataFrame) -> dict[tuple[str, str, str], Answered]:
-    """Return the items, with origins, answered by each (model, regime, dataset).
+    """Return by (model, regime, dataset) the answered items, with campaign and panel of each.
 
     Runs are pooled. `overall` covers the runs with all four datasets, and is left out if there is none.
     """

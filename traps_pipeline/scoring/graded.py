@@ -48,7 +48,7 @@ class GradedItem:
     posterior: Mapping[str, float]
 
     def label_of(self, value: str | None) -> str | None:
-        """Return the answer that a value names by the rules of correctness, or None."""
+        """Return the answer that a model's value names by the rules of correctness, or None."""
         of = self.answer_type, self.labels, self.aliases
         return next((label for label in self.labels if is_correct(value, label, *of)), None)
 
@@ -176,7 +176,7 @@ def _probability_metrics(item: GradedItem, stated: Mapping[str, float] | None) -
 
 
 def answer_points(item: GradedItem, label: str | None) -> dict[str, float]:
-    """Return an answer's expected points, and its regret split by reason.
+    """Return an answer's expected points, and its losses (regret) by reason.
 
     The regret is the loss against an ideal observer. label: None for an abstention.
     """
@@ -244,7 +244,7 @@ def _row(items: pd.DataFrame, named: str, resampling: Resampling) -> dict[str, A
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many GRADED_CUTS rows break their definition; null is not wrong.
+    """Return the number of GRADED_CUTS rows that break their definition; null is not wrong.
 
     A row is wrong if a metric lies outside its limits or its interval, or if a regret is not the sum of its parts or
     not the distance to the ideal.

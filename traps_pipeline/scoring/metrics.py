@@ -34,7 +34,7 @@ SCOPED_BY: Mapping[str, tuple[str, ...]] = {
 
 
 def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return COUNTS of every verdict, 0 or 1 each, (items, 6) int64.
+    """Return for every verdict the COUNTS, 0 or 1 each, as a frame (items, 6) of int64.
 
     The index is that of the verdicts. A null decision counts in no denominator: shares are over decided items.
     """
@@ -55,7 +55,7 @@ def decision_counts(verdicts: pd.DataFrame) -> pd.DataFrame:
 
 
 def n_items(counts: Any) -> Any:
-    """Return how many items METRICS rows are of: each item has one outcome."""
+    """Return the number of items behind METRICS rows: each item has one outcome."""
     return sum(counts[name] for name in OUTCOMES)
 
 
@@ -188,7 +188,7 @@ def _share(sums: pd.DataFrame, name: str) -> np.ndarray:
 
 
 def wrong_metrics(cells: pd.DataFrame) -> int:
-    """Return how many metrics of METRICS rows break their definition.
+    """Return the number of metrics in METRICS rows that break their definition.
 
     A metric is wrong if it is a share or bound outside [0, 1], or a PECS that is not Acc x max(0, J) or lies outside
     its bounds. Null metrics (nothing decided) are not wrong.

@@ -26,7 +26,7 @@ STUDIES, RESAMPLES, SEED = 400, 400, 7  # 0.3 s; the width is off by less than 2
 
 @dataclass(frozen=True)
 class Shares:
-    """A model's assumed shares; the defaults lie in the middle of the paper's models."""
+    """The shares that a model is assumed to have; by default those amid the paper's models."""
 
     acc: float = 0.6
     abs_rec: float = 0.5
@@ -40,7 +40,7 @@ class Shares:
 
 @dataclass(frozen=True)
 class Precision:
-    """How narrow a study's intervals are, and which differences it finds.
+    """The width of a study's intervals, and the differences between models that it detects.
 
     width: width of PECS's 95 % interval. difference: the smallest one between two models with independent answers that
     a test at 5 % detects in 80 % of studies; among_all: the same after Holm's correction over the pairs of all models,

@@ -14,7 +14,7 @@ from traps_pipeline.scoring.two_way import two_way
 
 @dataclass(frozen=True)
 class Scores:
-    """METRICS, LEADERBOARD and TWO_WAY rows of the same verdicts."""
+    """The METRICS, LEADERBOARD and TWO_WAY rows that the same verdicts give."""
 
     metrics: pd.DataFrame
     board: pd.DataFrame

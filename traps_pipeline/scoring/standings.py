@@ -1,4 +1,4 @@
-"""Average over runs, per dataset and overall, with deviations (docs/spec.md 5.2)."""
+"""Average scores over runs, per dataset and overall, with deviations (docs/spec.md 5.2)."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -63,7 +63,7 @@ def standings(metrics: pd.DataFrame) -> pd.DataFrame:
 
 
 def means_over_runs(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Return CELL_METRICS by ENTRY from METRICS rows, as on the leaderboard."""
+    """Return the leaderboard's means of METRICS rows over runs: CELL_METRICS by ENTRY."""
     return group_metric(_runs(metrics).groupby(ENTRY, sort=True), CELL_METRICS)
 
 
@@ -144,7 +144,7 @@ def _ranks(board: pd.DataFrame, contrasts: pd.DataFrame) -> pd.DataFrame:
 
 
 def wrong_intervals(board: pd.DataFrame) -> int:
-    """Return how many intervals are out of order or outside their score's limits."""
+    """Return the number of intervals that are out of order or outside their score's limits."""
     n_wrong = 0
     for metric in METRIC_WORDS:
         low, high = (board[f"{metric}_ci_{end}"].to_numpy(float) for end in ("low", "high"))

@@ -124,7 +124,7 @@ def _refusal(items: pd.DataFrame) -> str | None:
 
 
 def wrong_rows(table: pd.DataFrame) -> int:
-    """Return how many TWO_WAY rows have a metric outside its limits or its interval."""
+    """Return the number of TWO_WAY rows with a metric outside its limits or its interval."""
     shares = table[[*SHARES]].to_numpy(float)
     is_wrong = ((shares < 0) | (shares > 1)).any(axis=1)
     for name, lowest in LOWEST.items():

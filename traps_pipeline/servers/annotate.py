@@ -20,7 +20,7 @@ from traps_pipeline.base.webguard import TOKEN_OWNER
 from traps_pipeline.base.yamlfile import faults_of
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.people.judge_validation import sheet_rows
-from traps_pipeline.people.label_units import TASKS, TaskName, annotation_protocol, queue_of, require_task, sample
+from traps_pipeline.people.label_units import TASKS, TaskName, annotation_protocol, personal_order, require_task, sample
 from traps_pipeline.people.labels import LABELS
 from traps_pipeline.protocol.cells import Cell, Evaluation
 from traps_pipeline.servers.labelstore import LabelStore, NotWaiting
@@ -113,7 +113,7 @@ class Annotation:
         if task == "answerability":  # a clip or an answer of any task reveals the scenario
             sitting_start = time.time() - 3600 * annotation_protocol().sitting_hours
             met = {shown_unit.scenario_id for shown_unit in shown_units if shown_unit.at > sitting_start}
-        open_units = (unit for unit in queue_of(who, sample) if unit not in finished)
+        open_units = (unit for unit in personal_order(who, sample) if unit not in finished)
         return next((unit for unit in open_units if sample.loc[unit, "scenario_id"] not in met), None)
 
     def find(self, who: str, handle: str) -> tuple[TaskName, str]:

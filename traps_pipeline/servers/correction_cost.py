@@ -18,7 +18,8 @@ from traps_pipeline.models.registry.entries import NETWORK, load_models
 from traps_pipeline.models.registry.judges import load_panel
 from traps_pipeline.pipeline.wanted import StudyPartitions
 from traps_pipeline.protocol.cells import Cell
-from traps_pipeline.protocol.datasets import DATASETS, SIDES, is_ill_posed, taxonomy_of
+from traps_pipeline.protocol.datasets import DATASETS, SIDES, TWO_EVENTS, is_ill_posed, taxonomy_of
+from traps_pipeline.protocol.two_events import lane_items
 from traps_pipeline.storage.workspace import Workspace
 
 
@@ -71,10 +72,10 @@ def correction_effect(workspace: Workspace, spec: Mapping[str, Any], correction:
     seats = len(load_panel(workspace.study.panel))
     cost = CorrectionEffect(question=question, rendered=[spec["scenario_id"]] if renders else [])
     for model, dataset, evaluations in _evaluation_counts(workspace, spec["taxonomy"]):
-        for side in SIDES:
+        lanes = {item.item_id: item.side for item in lane_items(spec["scenario_id"])} if dataset == TWO_EVENTS else {}
+        for item, side in (lanes or {f"{dataset}:{spec['scenario_id']}:{side}": side for side in SIDES}).items():
             is_ill_posed_void = is_ill_posed(dataset) and side == "void"
             is_asked_again = renders or (ill_posed if is_ill_posed_void else asked_again)
-            item = f"{dataset}:{spec['scenario_id']}:{side}"
             if is_asked_again or (judged_again and side == "control"):
                 cost.items += [] if item in cost.items else [item]
                 cost.votes += evaluations * seats * (len(tasks_for(side)) if is_asked_again else 1)
@@ -95,8 +96,9 @@ def _question(spec: Mapping[str, Any], params: Mapping[str, Any]) -> str:
 def _evaluation_counts(workspace: Workspace, taxonomy: str) -> Iterator[tuple[str, str, int]]:
     """Yield model, dataset of the taxonomy, and the number of its evaluations that experiments want."""
     cells = [Cell.parse(key) for key in StudyPartitions(workspace).cells]
-    counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in DATASETS)
-    yield from ((model, d, count) for (model, d), count in sorted(counts.items()) if taxonomy_of(d) == taxonomy)
+    datasets = [TWO_EVENTS] if taxonomy == TWO_EVENTS else [d for d in DATASETS if taxonomy_of(d) == taxonomy]
+    counts = Counter((c.evaluation.model, c.dataset) for c in cells if c.dataset in datasets)
+    yield from ((*each, count) for each, count in sorted(counts.items()))
 
 
 def _dollars(model: str, calls: int) -> float | None:

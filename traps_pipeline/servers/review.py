@@ -9,27 +9,29 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from fastapi import FastAPI
 from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from traps_pipeline.base.errors import TrapsError
 from traps_pipeline.base.yamlfile import faults_of
-from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, read_corrections
+from traps_pipeline.benchmark.corrections import WORDS, Correction, load_scenarios, load_two_events, read_corrections
 from traps_pipeline.benchmark.decisions import DecidedMeanwhile, decisions_on, is_reviewed, save_decision, undo_decision
 from traps_pipeline.benchmark.records import load_released
 from traps_pipeline.models.asking.answer_rows import RESPONSES
 from traps_pipeline.pipeline.experiment import EXPERIMENTS
+from traps_pipeline.protocol.datasets import TWO_EVENTS
+from traps_pipeline.protocol.two_events import CLIPS, LANES, lane_items
 from traps_pipeline.report.explorer.scenario_words import answer_of_control, certificate_phrases, intervention
+from traps_pipeline.scenes.worlds.lane_records import TwoEventsSpec
 from traps_pipeline.servers.correction_cost import CorrectionEffect, correction_effect
 from traps_pipeline.servers.queue import MEANINGS, QUEUES, QueueName, flags, queue
 from traps_pipeline.servers.server import Conflict, NotFound, Refused, new_app, page_html, script, study_file
-from traps_pipeline.storage.benchmark_tables import SCENE_SPECS, VIDEOS
+from traps_pipeline.storage.benchmark_tables import ARMS, SCENE_SPECS, VIDEOS
 from traps_pipeline.storage.workspace import Workspace
 
 SCRIPTS = ("dom.js", "keys.js", "search.js", "player.js", "listening.js", "review.js")
-STRIP_FRAMES, STRIP_WIDTH = 8, 200  # frames of a side in the contact strip, and their width in pixels
+OBSERVED_LANES = ("left.neither", "left.both")  # items of two events of which the page has the observer's answer
 Record = Mapping[str, Any]
 
 
@@ -73,17 +75,27 @@ class Review:
 
     @cached_property
     def specs(self) -> dict[str, Record]:
-        """SCENE_SPECS rows by scenario. Raises TrapsError without any."""
+        """SCENE_SPECS rows by scenario, and rows like them of two events. Raises TrapsError without any."""
         rows = self.workspace.tables.read_all(SCENE_SPECS).sort_values("scenario_id").to_dict("records")
-        if not rows:
+        pairs = {str(row["scenario_id"]): {str(k): v for k, v in row.items()} for row in rows}
+        lanes = load_two_events(self.workspace.study).items()
+        scenarios = pairs | {id_: _lane_row(each.spec) for id_, each in lanes if (id_, "neither") in self.clips}
+        if not scenarios:
             raise TrapsError(f"{self.workspace.root}: has no scenes yet; run `traps run EXPERIMENT` in it first")
-        return {str(row["scenario_id"]): {str(k): v for k, v in row.items()} for row in rows}
+        return scenarios
 
     @cached_property
     def clips(self) -> dict[tuple[str, str], Record]:
-        """VIDEOS rows by scenario and side."""
+        """VIDEOS rows by scenario and side, and path and rate of clips of two events by scenario and clip."""
         rows = self.workspace.tables.read_all(VIDEOS).to_dict("records")
-        return {(str(row["scenario_id"]), str(row["side"])): {str(k): v for k, v in row.items()} for row in rows}
+        clips: dict[tuple[str, str], Record] = {
+            (str(row["scenario_id"]), str(row["side"])): {str(k): v for k, v in row.items()} for row in rows
+        }
+        arms = self.workspace.tables.read_all(ARMS, ["scenario_id", "arm", "item", "clip", "n_frames", "duration_s"])
+        for row in arms.loc[arms["arm"] == TWO_EVENTS].to_dict("records"):
+            key = str(row["scenario_id"]), str(row["item"]).partition(".")[2]
+            clips[key] = {"path": row["clip"], "fps": row["n_frames"] / row["duration_s"]}
+        return clips
 
     @cached_property
     def flags(self) -> Any:
@@ -114,10 +126,12 @@ class Review:
         return queue(name, list(self.specs), self.reviewed(), self.flags)
 
     def decide(self, sent: Decision) -> None:
-        """Append a decision. Raises NotFound, Refused and Conflict."""
+        """Append a reviewer's decision about a scenario to the corrections. Raises NotFound, Refused and Conflict."""
         spec = self.spec(sent.scenario_id)
         correction, decision_count = self._correction(sent.scenario_id, sent.action, sent.changes, sent.why), sent.seen
         if sent.action == "add":
+            if spec["taxonomy"] == TWO_EVENTS:
+                raise Refused(f"{sent.scenario_id}: scenarios of two events are drawn, not added")
             params = json.loads(spec["params"]) | (correction.params or {})
             new = {"scenario_id": self._free_id(spec["family"]), "family": spec["family"], "params": params}
             correction, decision_count = correction.model_copy(update=new), 0
@@ -160,12 +174,14 @@ class Review:
         """Return the effect of the decisions that the study's tables do not contain yet."""
         scenarios = load_scenarios(self.workspace.study)
         total = CorrectionEffect(added=sorted({*scenarios} - {*self.specs}))
+        lanes = load_two_events(self.workspace.study)
         for scenario_id, spec in self.specs.items():
-            scenario = scenarios.get(scenario_id)
+            scenario = lanes.get(scenario_id) or scenarios.get(scenario_id)
+            params = getattr(scenario, "params", None)
             if scenario is None:
                 total.gone.append(scenario_id)
-            elif scenario.words or scenario.params is not None:
-                changes = dict(scenario.words) | ({"params": dict(scenario.params)} if scenario.params else {})
+            elif scenario.words or params is not None:
+                changes = dict(scenario.words) | ({"params": dict(params)} if params else {})
                 correction = self._correction(scenario_id, "correct", changes, "summary")
                 total = total.plus(correction_effect(self.workspace, spec, correction))
         return total
@@ -177,24 +193,22 @@ class Review:
         spec, scenarios = self.spec(scenario_id), self.queue(name)
         decisions = decisions_on(scenario_id)
         place = scenarios.index(scenario_id) if scenario_id in scenarios else -1
-        void = "another" if json.loads(spec["evidence"]).get("twin_px") else "same"
+        captions = _captions(spec)
         items = {side: f"{spec['taxonomy']}:{scenario_id}:{side}" for side in ("control", "void")}
+        if spec["taxonomy"] == TWO_EVENTS:
+            items = {item.side: item.item_id for item in lane_items(scenario_id) if item.name in OBSERVED_LANES}
         fields = {
             "scenario_id": scenario_id,
             "seen": len(decisions),
             "queue": name,
-            "fps": self.clips.get((scenario_id, "control"), {}).get("fps"),
-            "clips": [side for side in ("control", "void", "twin") if (scenario_id, side) in self.clips],
+            "fps": self.clips.get((scenario_id, next(iter(captions))), {}).get("fps"),
+            "clips": [side for side in captions if (scenario_id, side) in self.clips],
             "before": scenarios[place - 1] if place > 0 else "",
             "after": next((scenario for scenario in scenarios[place + 1 :] if scenario != scenario_id), ""),
             "params": json.loads(spec["params"]),
             "words": {word: _as_json(spec[word]) for word in ("question", "ill_posed_question", "labels")}
             | {"answer": spec["ground_truth"]},
-            "captions": {
-                "control": f"Control: {answer_of_control(spec)}",
-                "void": f"Void: {intervention(spec)}",
-                "twin": f"Twin, {void} void: {json.loads(spec['twin'])['ground_truth']}",
-            },
+            "captions": captions,
         }
         return page_html(
             "review.html.j2",
@@ -232,31 +246,31 @@ class Review:
         target = f"{shlex.quote(name)} --workspace {shlex.quote(str(self.workspace.root))}"
         return [f"traps status {target}", f"traps run {target}"]
 
-    def strip(self, scenario_id: str) -> bytes:
-        """Return a JPEG of control frames above the void's. Raises NotFound."""
-        import cv2
-
-        from traps_pipeline.video.encode import decode
-
-        self.spec(scenario_id)
-        side_frames = [decode(self.clip(scenario_id, side))[0] for side in ("control", "void")]
-        places = np.linspace(0, len(side_frames[0]) - 1, STRIP_FRAMES).round().astype(int)
-        size = (STRIP_WIDTH, side_frames[0].shape[1] * STRIP_WIDTH // side_frames[0].shape[2])
-        blank = np.full((size[1], size[0], 3), 235, np.uint8)  # after the end of a clip
-
-        def small(frames: np.ndarray, k: int) -> np.ndarray:
-            return cv2.resize(frames[k], size, interpolation=cv2.INTER_AREA) if k < len(frames) else blank
-
-        rows = [np.hstack([small(frames, k) for k in places]) for frames in side_frames]
-        _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(np.vstack(rows)[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
-        return jpeg.tobytes()
-
     def clip(self, scenario_id: str, side: str) -> Path:
         """Return the file of a clip. Raises NotFound if the study has none."""
         row = self.clips.get((scenario_id, side))
         if row is None:
             raise NotFound(f"{scenario_id}: the study has no {side} clip of it")
         return study_file(self.workspace, row["path"])
+
+
+def _lane_row(spec: TwoEventsSpec) -> Record:
+    fields = {name: getattr(spec, name) for name in ("scenario_id", "family", "category", "question", "labels")}
+    truths = "; ".join(f"{lane}: {record.ground_truth}" for lane, record in zip(LANES, spec.lanes, strict=True))
+    empty = {"ill_posed_question": "", "params": "{}", "evidence": "{}"}
+    return fields | {"sub_scenario": "two events", "taxonomy": TWO_EVENTS, "ground_truth": truths} | empty
+
+
+def _captions(spec: Record) -> dict[str, str]:
+    """Return title and note of each clip of a scenario, in their order."""
+    if spec["taxonomy"] == TWO_EVENTS:
+        return {clip: f"Hidden, {clip}: {spec['ground_truth']}" for clip in CLIPS}
+    void = "another" if json.loads(spec["evidence"]).get("twin_px") else "same"
+    return {
+        "control": f"Control: {answer_of_control(spec)}",
+        "void": f"Void: {intervention(spec)}",
+        "twin": f"Twin, {void} void: {json.loads(spec['twin'])['ground_truth']}",
+    }
 
 
 def _as_json(value: Any) -> Any:
@@ -283,10 +297,6 @@ def review_app(review: Review) -> FastAPI:
     @app.get("/clip/{scenario_id}/{side}")
     def clip(scenario_id: str, side: str) -> Response:
         return FileResponse(review.clip(scenario_id, side), media_type="video/mp4")
-
-    @app.get("/strip/{scenario_id}")
-    def strip(scenario_id: str) -> Response:
-        return Response(review.strip(scenario_id), media_type="image/jpeg")
 
     @app.get("/review.js")
     def code() -> Response:

@@ -52,7 +52,7 @@ class State:
 
 @dataclass(frozen=True)
 class StageOutput:
-    """A partition's unwritten rows or files, its tally, previews and check data."""
+    """What a stage built for a partition before it is written: rows or files, call counts and previews."""
 
     content: Sequence[Any] | pd.DataFrame | Mapping[str, bytes]
     tally: Tally = field(default_factory=Tally)
@@ -60,12 +60,12 @@ class StageOutput:
     beside: Any = None
 
     def rows(self, table: Table[Row]) -> Sequence[Row]:
-        """Return the rows of a table that is built row by row."""
+        """Return the built rows, objects of the table's row type."""
         return cast("Sequence[Row]", self.content)
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The rows of a table that is built as a frame."""
+        """The built rows as a frame, for a stage that builds one."""
         return cast("pd.DataFrame", self.content)
 
 
@@ -288,8 +288,8 @@ def read_sealed(path: Path) -> pa.Table:
     return pq.ParquetFile(_sound_bytes(path)).read()
 
 
-def note_of(path: Path) -> str:
-    """Return a store's note about a partition (footer, columns), or raise TrapsError."""
+def partition_note(path: Path) -> str:
+    """Return the text that a store notes beside a partition (footer, columns). Raises TrapsError."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -89,7 +89,7 @@ def wanted_questions(workspace: Workspace, cell: Cell) -> list[Question]:
 
 
 def asked_items(workspace: Workspace, dataset: str) -> list[dict[str, Any]]:
-    """Return the columns of items that requests, responses and votes use, in order."""
+    """Return a cell's items, in order, with the columns that requests, responses and votes use."""
     state = workspace.tables.state(ITEMS, {"dataset": dataset})
     return with_posteriors(workspace, dataset, _item_rows(workspace, dataset, state.version if state else ""))
 
@@ -106,7 +106,7 @@ def _item_rows(workspace: Workspace, dataset: str, version: str) -> list[dict[st
 
 
 def with_posteriors(workspace: Workspace, dataset: str, items: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add `posterior`, which strategy `bayes` reads, to items of graded cuts."""
+    """Return items of graded cuts with `posterior`, which strategy `bayes` reads; other items unchanged."""
     if dataset != GRADED:
         return items
     posterior_of = posteriors(workspace)

@@ -45,7 +45,7 @@ Finished = TypeVar("Finished")
 
 @dataclass(frozen=True)
 class SettledCell(Generic[AnyCell, AnyCall]):
-    """A cell whose calls are all answered, the ledger's row of each key, and a tally."""
+    """A cell whose calls are all answered, with the ledger's row of each key, and counts of the calls."""
 
     cell: AnyCell
     calls: Sequence[AnyCall]
@@ -53,11 +53,11 @@ class SettledCell(Generic[AnyCell, AnyCall]):
     tally: Tally
 
     def answered(self) -> Iterator[tuple[AnyCall, Row]]:
-        """Return each call with its ledger row."""
+        """Yield each call with its ledger row."""
         return ((call, self.rows[call.request.key]) for call in self.calls)
 
     def output(self, row_of: Callable[[AnyCell, AnyCall, Row], Any]) -> tuple[AnyCell, StageOutput]:
-        """Return the cell and its table, one row per call, with the tally of its calls."""
+        """Return the cell and its table, one row per call, with the counts of its calls."""
         dollars = sum(row["cost_usd"] or 0.0 for row in self.rows.values())
         shown = {"wanted": len(self.rows), "dollars": round(dollars, 6)}
         return self.cell, StageOutput([row_of(self.cell, *pair) for pair in self.answered()], self.tally, shown)
@@ -65,7 +65,7 @@ class SettledCell(Generic[AnyCell, AnyCall]):
 
 @dataclass(frozen=True)
 class Work(Generic[AnyCell, AnyCall, Finished]):
-    """A stage's work: who is asked, under which budget, each cell's calls, and how its table is made."""
+    """The calls of a stage to be asked: of whom, under which budget, by cell, and how its table is made."""
 
     stage: str
     ledger: Ledger
@@ -198,7 +198,7 @@ class _CellTask(Generic[AnyCell, AnyCall]):
 async def settle_evaluation(
     work: Work[AnyCell, AnyCall, Any], evaluation: Evaluation, cells: Sequence[AnyCell], stop: asyncio.Event
 ) -> AsyncIterator[SettledCell[AnyCell, AnyCall]]:
-    """Ask for the missing calls of one evaluation's cells; yield the finished cells in order.
+    """Ask for the missing calls of one evaluation's cells; yield the answered cells in order.
 
     While the last calls of a cell are in flight, those of the next are sent, so that no connection is idle.
     """

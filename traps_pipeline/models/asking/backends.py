@@ -12,7 +12,7 @@ from traps_pipeline.models.request import Backend, Outcome, OutcomeKind, Request
 
 
 def require_libraries(entry: Entry) -> None:
-    """Raise TrapsError, with the command, unless an entry's libraries are installed."""
+    """Raise TrapsError, naming the command that installs them, if an entry's libraries are missing."""
     if entry.backend == NETWORK:
         require_extra("api")
     if entry.backend == LOCAL:

@@ -119,7 +119,7 @@ class Participants:
 
 @dataclass(frozen=True)
 class CallContext:
-    """A call's context besides its participant, one value per call.
+    """The conditions under which one call is sent, besides its participant.
 
     stop: set when the run is to end. halted(): whether to stop sending calls. require(): raises TrapsError if only
     another process may send this one. paid_by: receives the reservations of attempts that cost something.
@@ -135,7 +135,7 @@ class CallContext:
 async def ask_once(
     participant: Participant, request: Request, allowed: CallContext
 ) -> tuple[Outcome, int, float] | None:
-    """Return an outcome, the number of attempts, and the last one's seconds.
+    """Return the outcome of a call, the number of attempts, and the last one's seconds.
 
     This is the one retry layer: exponential backoff with full jitter, and never sooner than the provider asks. The
     outcome's cost includes what earlier attempts may have cost. None if halted before anything was spent.
@@ -255,7 +255,7 @@ async def _is_stopped_within(stop: asyncio.Event, seconds: float) -> bool:
 def ledger_row(
     request: Request, outcome: Outcome, attempts: int, latency_s: float, epoch: str
 ) -> tuple[Row, dict[str, str]]:
-    """Return an answer's row and side texts: reasoning trace, malformed answer."""
+    """Return the ledger's row of an outcome, and side texts: reasoning trace, malformed answer."""
     fields = asdict(outcome)
     side_texts = {name: text for name in SIDE_TEXTS if (text := fields.pop(name)) is not None}
     if fields["first_token"] is None:
@@ -272,5 +272,5 @@ def ledger_row(
 
 
 def call_time_columns(row: Row) -> Row:
-    """Return the epoch and time of a row's call, columns of all tables from a ledger."""
+    """Return the epoch and time of a row's call as columns, which all tables from a ledger have."""
     return {"epoch": row["epoch"], "created_at": datetime.fromisoformat(row["created_at"])}

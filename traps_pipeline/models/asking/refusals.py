@@ -21,7 +21,7 @@ _OF_A_CALL = re.compile(r"http_(?!401$|402$|403$|404$|405$|407$)4\d\d(_denied)?"
 
 @dataclass
 class RefusedCalls:
-    """Calls of one form that a provider refused, and one that it answered."""
+    """Calls of one form that a provider refused, and one (`control`) that it answered."""
 
     refused: list[Request] = field(default_factory=list)
     control: Request | None = None
@@ -41,12 +41,12 @@ def refused_calls(requests: Iterable[Request], rows: Mapping[str, Row]) -> Itera
 
 
 def control_outcome(outcome: Outcome) -> Outcome:
-    """Return the outcome of a repeated call, as a failure, which never replaces the answer that is there."""
+    """Return the outcome of the repeated answered call as a failure, which never replaces its answer."""
     if outcome.kind not in WITH_TEXT:
         return outcome
     return replace(outcome, kind="error", error=CONTROL, text=None, reasoning=None, first_token=None)
 
 
 def refusal(row: Row) -> Outcome:
-    """Return a failed call's row as a refusal; its cost is in that row."""
+    """Return a failed call's row as the outcome of a refusal; its cost is in that row."""
     return Outcome("refused", error=row["error"], client=row.get("client"), cost_usd=0.0)

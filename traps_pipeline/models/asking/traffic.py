@@ -108,7 +108,7 @@ class RateLimiter:
 
 
 class ParticipantStopped(TrapsError):
-    """A participant that is no longer asked; the others go on."""
+    """Raised for a participant that is no longer asked; the others go on."""
 
 
 _stopped: list[dict[str, str]] = []  # one per active `remembering_stops`: participant to message
@@ -125,7 +125,7 @@ def remembering_stops() -> Iterator[None]:
 
 
 class CircuitBreaker:
-    """A circuit breaker for one participant."""
+    """A circuit breaker for one participant: it stops the asking after repeated failures."""
 
     def __init__(self, participant: str, address: str | None = None) -> None:
         self._participant, self._address = participant, address
@@ -142,7 +142,7 @@ class CircuitBreaker:
                 raise ParticipantStopped(stops[self._participant])
 
     def no_connection(self, why: str = "") -> None:
-        """Raise ParticipantStopped, with the reason, after five unsent calls in a row over some time."""
+        """Count an unsent call; raise ParticipantStopped after five in a row over some time."""
         self._unmade += 1
         self._unmade_since = self._unmade_since or time.monotonic()
         if self._unmade >= UNMADE_IN_A_ROW and time.monotonic() - self._unmade_since >= UNMADE_S:

@@ -17,7 +17,7 @@ from traps_pipeline.models.request import Outcome, Request
 
 @dataclass
 class EvaluationState:
-    """What the cells of an evaluation share. reported: places of the ledger. is_over: no call is sent any more."""
+    """The state that an evaluation's cells share. reported: places of the ledger. is_over: no call is sent any more."""
 
     participants: Participants
     budget: Budget
@@ -34,7 +34,7 @@ class EvaluationState:
 
 @dataclass
 class Asking:
-    """Workers over a cell's missing requests. again: what to record of a call that is repeated to settle it."""
+    """The workers that ask a cell's missing requests. again: what to record of a call that is repeated to settle it."""
 
     its: EvaluationState
     missing: Sequence[Request]
@@ -65,10 +65,15 @@ class Asking:
         if attempt_result is None:
             return False
         outcome = attempt_result[0] if self.again is None else self.again(attempt_result[0])
-        row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
-        progress.current().called(name, not is_settled(row), row["latency_s"], row["cost_usd"] or 0.0)
-        if self.again is None:
-            participant.breaker.watch(outcome)
+        try:
+            if self.again is None:
+                participant.breaker.watch(outcome)
+        except TrapsError:  # the participant is stopped
+            self.its.is_over = True  # at once: no further call is sent while the row is written
+            raise
+        finally:
+            row = await self.write(request, outcome, *attempt_result[1:], [each.id for each in context.paid_by])
+            progress.current().called(name, not is_settled(row), row["latency_s"], row["cost_usd"] or 0.0)
         return True
 
     async def write(self, request: Request, outcome: Outcome, attempts: int, seconds: float, paid_by: list[str]) -> Row:

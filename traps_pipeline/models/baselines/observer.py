@@ -12,17 +12,17 @@ from traps_pipeline.video.policies import FramePolicy
 
 @lru_cache(maxsize=100_000)
 def observer_answer(media_digest: str, clip: Path, question: str, frames: FramePolicy) -> str | None:
-    """Return the observer's answer from these frames, cached for regimes and runs."""
+    """Return the answer that the observer reads from these frames; None if it abstains."""
     from traps_pipeline.scenes.observe import observe
 
     return observe(clip, question, frames)
 
 
 class ObserverBackend:
-    """A backend that answers by classical vision on the clip, without its record."""
+    """A backend that answers by classical vision on the clip, without the scenario's record."""
 
     async def ask(self, request: Request) -> Outcome:
-        """Return the outcome of one attempt; see `Backend`."""
+        """Return the outcome of one attempt to answer a request."""
         assert request.media is not None, "the observer is asked about clips"
         frames = observer_frames(dataset_of(str(request.about["item_id"])))
         import asyncio

@@ -82,7 +82,7 @@ STRATEGIES: Mapping[str, Strategy] = {
 
 
 def phrase(answer: str | None, request: Request) -> str:
-    """Format an answer for the request's regime (plain text or JSON)."""
+    """Return the text of an answer in the form that the request's regime asks for (plain or JSON)."""
     if answer is None:
         reason, final = "The clip does not show what decides the outcome.", ABSTENTION
     else:
@@ -112,7 +112,7 @@ class ReferenceBackend:
         self._attempts: Counter[str] = Counter()
 
     async def ask(self, request: Request) -> Outcome:
-        """Return the outcome of one attempt; see `Backend`."""
+        """Return the outcome of one attempt to answer a request."""
         import asyncio
 
         await asyncio.sleep(0)

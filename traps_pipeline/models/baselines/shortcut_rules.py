@@ -53,7 +53,7 @@ class RuleBackend:
     """A reference strategy that plays the rule that `params.rule` names."""
 
     async def ask(self, request: Request) -> Outcome:
-        """Return the outcome of one attempt; see `Backend`."""
+        """Return the outcome of one attempt to answer a request."""
         assert request.media is not None, "a rule is asked about clips"
         import asyncio
 

@@ -1,4 +1,4 @@
-"""Adapt any image-text-to-text model: prompts in, hidden states and answers out.
+"""Adapt any image-text-to-text model: prompts go in, hidden states and answers come out.
 
     model = load_local_model(get_model("pocket"))
     prompt = model.prompt(system, question, frames, times_s)      # frames (N, H, W, 3) uint8, seconds into the clip

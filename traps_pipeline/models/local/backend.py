@@ -26,7 +26,7 @@ GATHER_S = 0.01  # wait after the first request for others that become free toge
 
 @cache
 def worker(device: str) -> ThreadPoolExecutor:
-    """Return the thread that works with the models of a device."""
+    """Return the executor whose one thread works with the models of a device."""
     return ThreadPoolExecutor(1, thread_name_prefix=f"local-model-{device}")
 
 

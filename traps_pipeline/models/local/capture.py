@@ -26,7 +26,7 @@ ONE_TOKEN: tuple[Pooling, ...] = ("last", "answer")
 
 @dataclass
 class CapturedStates:
-    """One pass's states on its device: embeddings and block outputs `raw`, each (d,)."""
+    """The states of one pass on its device: embeddings and block outputs `raw`, each (d,)."""
 
     raw: list[Tensor] = field(default_factory=list)
     normed: Tensor | None = None
@@ -38,7 +38,7 @@ def first_tensor(output: Any) -> Tensor:
 
 
 def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tensor:
-    """Pool (1, T, d) to (d,): the last token's state, or a mean.
+    """Return states (1, T, d) pooled to (d,): the last token's state, or a mean.
 
     The state of the last token is in the model's precision; the mean over all tokens, or over those that a mask (T,)
     selects, is in float32. The result is a copy: a view would keep the whole tensor alive.
@@ -54,7 +54,7 @@ def pool(states: Tensor, pooling: Pooling, chosen: Tensor | None = None) -> Tens
 def capture_states(
     blocks: Iterator[Module], norm: Module, pooling: Pooling, chosen: Tensor | None = None
 ) -> Iterator[CapturedStates]:
-    """Keep the pooled states of passes within the block; remove all hooks afterwards."""
+    """Yield the pooled states of passes within the block; remove all hooks afterwards."""
     states = CapturedStates()
 
     def embeddings(_: Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ _lock, _renderer = Lock(), list[Connection]()  # to the process, while there is 
 
 
 def render(checkpoint: str, template: str, turns: Sequence[Mapping[str, Any]], variables: Mapping[str, Any]) -> str:
-    """Render chat turns into a model's prompt, as transformers does. Raises TrapsError if the template fails."""
+    """Return a model's prompt from chat turns, as transformers renders it. Raises TrapsError if the template fails."""
     request = {"chat_template": template, "conversations": [turns], "add_generation_prompt": True, **variables}
     with _lock:
         try:

@@ -26,19 +26,19 @@ class DecodingModel(Protocol):
 
 
 class Steers(Protocol):
-    """Anything that changes hidden states in a pass, as `mechanism.hook.Steering`."""
+    """An object that changes hidden states in a pass, such as `mechanism.hook.Steering`."""
 
     def rows(self, chosen: Sequence[int]) -> Steers:
-        """Return the steering of some of the prompts."""
+        """Return the steering of the selected prompts of the batch."""
         ...
 
     def applied(self, model: Any) -> AbstractContextManager[None]:
-        """Steer the model's passes inside the context."""
+        """Steer the model's passes within the block."""
         ...
 
 
 def steering_context(steering: Steers | None, model: DecodingModel) -> AbstractContextManager[None]:
-    """Return the steering's context, or one that does nothing."""
+    """Return a context that steers, or without steering one that does nothing."""
     return nullcontext() if steering is None else steering.applied(model)
 
 

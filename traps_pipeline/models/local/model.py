@@ -96,7 +96,7 @@ class LocalModel:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """Inputs of hidden states besides the prompt (no paths, no device), for keys."""
+        """The settings that decide hidden states besides the prompt (no paths, no device), for keys."""
         return {
             "checkpoint_digest": self.checkpoint.digest,
             "class": type(self.network).__name__,
@@ -124,7 +124,7 @@ class LocalModel:
         return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def block(self, layer: int) -> Module:
-        """Return the block with output hidden_states[layer]. Raises TrapsError."""
+        """Return the block whose output is hidden_states[layer]. Raises TrapsError for a layer that is missing."""
         if not 1 <= layer <= self.n_layers:
             raise TrapsError(
                 f"{self.checkpoint.name}: no block {layer}; it has blocks 1 to {self.n_layers} (layer 0 are the "
@@ -135,7 +135,7 @@ class LocalModel:
     # --- prompts ------------------------------------------------------------------------------------------------------
 
     def prompt(self, system: str, user: str, frames: np.ndarray, times_s: Sequence[float] | np.ndarray) -> Prompt:
-        """Return system prompt, then clip and question, nothing else (docs/spec.md 3.3).
+        """Return the prompt: system prompt, then clip and question, nothing else (docs/spec.md 3.3).
 
         frames: (N, H, W, 3) uint8 RGB, all of them shown. times_s: (N,) seconds into the clip, which models that read
         time stamps get exactly. Raises TrapsError if the chat template loses a part.
@@ -312,7 +312,7 @@ class LocalModel:
 
 
 def shown_frames(marks: Sequence[int]) -> int:
-    """Return the number of a clip's frames, as computed from the indices of the N shown.
+    """Return the number of frames of a clip, from the indices of the N shown.
 
     Classes that take one number for the step compute it as this over N (Qwen2.5-VL).
     """

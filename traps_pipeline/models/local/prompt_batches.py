@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """A prompt's text, rendered by the chat template, and the processor's inputs.
+    """The text of a prompt, rendered by the chat template, and the processor's inputs.
 
     text: before the clip is expanded. inputs: on the CPU, each with a first axis of one prompt (or of its patches or
     frames).
@@ -29,11 +29,11 @@ class Prompt:
 
     @property
     def sequences(self) -> list[str]:
-        """Names of the inputs with one value per token."""
+        """The names of the inputs with one value per token."""
         return [name for name, value in self.inputs.items() if value.shape == self.inputs["input_ids"].shape]
 
     def followed_by(self, tokens: Sequence[int]) -> Prompt:
-        """Return the prompt followed by tokens of an answer."""
+        """Return the prompt continued by tokens of an answer."""
         import torch
 
         inputs = dict(self.inputs)
@@ -45,7 +45,7 @@ class Prompt:
 
     @property
     def form(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
-        """The shapes that a batch shares: those of clips' tensors without the first axis."""
+        """The shapes that prompts of a batch share: those of clips' tensors without the first axis."""
         clip = sorted(self.inputs.keys() - set(self.sequences))
         return tuple((name, tuple(self.inputs[name].shape[1:])) for name in clip)
 

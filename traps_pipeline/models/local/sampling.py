@@ -21,12 +21,12 @@ class Sampling:
     seeds: Sequence[int]
 
     def rows(self, chosen: Sequence[int]) -> Sampling:
-        """Return the sampling of some of the prompts."""
+        """Return the sampling of the selected prompts of the batch."""
         return Sampling(self.temperature, self.top_p, [self.seeds[i] for i in chosen])
 
 
 class SeededNucleus:
-    """A logits processor that leaves one token, drawn from each row's own stream.
+    """A logits processor that leaves one token, drawn by each row's own random stream.
 
     Greedy decoding then picks that token. The nucleus is the smallest set of tokens whose probability reaches top_p.
     """

@@ -1,4 +1,4 @@
-"""Name inputs of a block besides the residual stream and its own cache.
+"""Read and replace a block's inputs other than the residual stream and its own cache (side paths).
 
 Gemma 4 has two such paths, both of them arguments of its blocks. Its upper blocks compute no keys and values: each
 reads those of the last lower block with its kind of attention (`shared_kv_states`, a mapping by kind). And every block
@@ -32,7 +32,7 @@ _FIELDS: dict[str, tuple[Argument | None, str]] = {
 
 
 def unknown_side_path(config: Any, block: Module) -> str | None:
-    """Describe a configured path that no known argument of the blocks covers, if any."""
+    """Return in words an input that the configuration gives to blocks and this module does not know; None if none."""
     for field, (argument, path) in _FIELDS.items():
         if getattr(config, field, 0) and argument not in _arguments(type(block)):
             return f"{path} ({field})"
@@ -40,7 +40,7 @@ def unknown_side_path(config: Any, block: Module) -> str | None:
 
 
 def argument_of(block: Module, name: Argument, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Return a call's argument of a block; None if it is missing from either."""
+    """Return the value of an argument in a call of a block; None if the block or the call lacks it."""
     names = _arguments(type(block))
     place = names.index(name) if name in names else len(args)
     return args[place] if place < len(args) else kwargs.get(name)
@@ -49,7 +49,7 @@ def argument_of(block: Module, name: Argument, args: tuple[Any, ...], kwargs: di
 def with_argument(
     block: Module, name: Argument, value: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Return the arguments of a call of a block with one of them replaced."""
+    """Return the arguments (args, kwargs) of a call of a block with one of them replaced."""
     place = _arguments(type(block)).index(name)
     if place < len(args):
         return (*args[:place], value, *args[place + 1 :]), kwargs

@@ -27,7 +27,7 @@ _STAMP = re.compile(r"<\d+(?:\.\d+)?seconds>|\d\d:\d\d(?!\d)")
 
 
 def token_spans(model: LocalModel, prompt: Prompt, system: str, question: str) -> dict[str, np.ndarray]:
-    """Return, by part, whether each token of the prompt belongs to it, (T,) bool.
+    """Return by part of the prompt a mask of the tokens that belong to it, (T,) bool.
 
     No token belongs to two parts; those of the chat template belong to none. Raises TrapsError if a part cannot be
     found.
@@ -64,13 +64,13 @@ def token_spans(model: LocalModel, prompt: Prompt, system: str, question: str) -
 
 
 def visual_tokens(model: LocalModel, prompt: Prompt) -> np.ndarray:
-    """Return which tokens of a prompt stand for pictures, (T,) bool."""
+    """Return a mask of the prompt's tokens that stand for pictures, (T,) bool."""
     placeholders = {getattr(model.processor, f"{kind}_token_id", None) for kind in ("image", "video")}
     return np.isin(prompt.inputs["input_ids"][0].tolist(), [token for token in placeholders if token is not None])
 
 
 def changed_tokens(first: Prompt, second: Prompt, visual: np.ndarray) -> np.ndarray | None:
-    """Return where two prompts' visual tokens differ, by their pixels: (T,) bool.
+    """Return a mask of the visual tokens whose pixels differ between two prompts, (T,) bool; None if unknown.
 
     None if the clips have different numbers of pixels, or the processor's pixels do not come token by token. Qwen's do:
     the patches that are merged into one token follow each other.

@@ -37,7 +37,7 @@ class _Features:
 
 
 class ClipMemory:
-    """Features of the latest clips; `passes` counts those that the tower encoded."""
+    """The vision tower's features of the latest clips; `passes` counts those that it encoded."""
 
     def __init__(self) -> None:
         self.passes = 0

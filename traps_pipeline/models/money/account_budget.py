@@ -22,7 +22,7 @@ CAP, SPENT, LOCK = "budget.yaml", "spent.json", "spent.lock"
 
 
 class Cap(BaseModel):
-    """`budget.yaml` of an account's folder: dollars for all studies together, ever."""
+    """The contents of `budget.yaml` in an account's folder: dollars for all studies together, ever."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     usd: float = Field(ge=0, allow_inf_nan=False)
@@ -79,7 +79,7 @@ class AccountBudget:
                 self._add(self._read(), dollars)
 
     def explain(self, worst_usd: float) -> str:
-        """Return a sentence that says why an account's budget has no room for a call."""
+        """Return in words why an account's budget has no room for a call."""
         spent_usd = self.spent_usd
         return (
             f"the budget of the account {self.account} is reached: {len(spent_usd)} studies have spent "

@@ -24,19 +24,19 @@ BYTES_A_TOKEN = 1  # some tokenizers make a token of every digit, and judges are
 
 
 class BudgetReached(TrapsError):
-    """No room is left for another call."""
+    """Raised where the budget has no room for another call."""
 
 
 @dataclass(frozen=True)
 class Tokens:
-    """The maximum tokens of a call."""
+    """The maximum numbers of prompt and completion tokens of a call."""
 
     prompt: int
     completion: int
 
 
 def most_tokens(entry: Entry, request: Request) -> Tokens:
-    """Return an upper bound of a call's tokens."""
+    """Return upper bounds of a call's tokens."""
     frames = request.sent.n_frames if request.sent else 0
     dataset = dataset_of(str(request.about.get("item_id", "")))
     tokens_per_frame = frame_bound(entry, dataset) if isinstance(entry, ModelEntry) else 0
@@ -72,7 +72,7 @@ def check_money(study: Study, entry: Entry) -> None:
 
 @dataclass(frozen=True)
 class Reservation:
-    """A call's maximum dollars, held from before it is sent until its row is stored."""
+    """The maximum dollars of a call, held from before it is sent until its row is stored."""
 
     id: str
     participant: str
@@ -159,7 +159,7 @@ class Budget:
 
 
 def budget_reached_reason(participant: str | None, spent_usd: float, cap_usd: float, worst_usd: float) -> str:
-    """Return why a budget (None: the study's) leaves no room for a call."""
+    """Return in words why a budget (None: the study's) leaves no room for a call."""
     return (
         f"the budget of {participant or 'the study'} is reached: ${spent_usd:.2f} of ${cap_usd:.2f} spent, the next "
         f"call may cost ${worst_usd:.4f}. Raise it (--budget-usd, or study.yaml) and run the same command to go on"

@@ -29,7 +29,7 @@ LOW_SHARE = 0.4  # share of the expected completion that a terse model takes
 
 @dataclass(frozen=True)
 class Experience:
-    """Means over answered calls, None if unknown: prompt, completion tokens, seconds."""
+    """The mean tokens and seconds of a participant's answered calls; None if unknown."""
 
     prompt_tokens: float | None = None
     completion_tokens: float | None = None
@@ -38,7 +38,7 @@ class Experience:
 
 @dataclass(frozen=True)
 class Forecast:
-    """The predicted cost of calls.
+    """The predicted tokens, dollars and minutes of a participant's calls.
 
     Tokens are expected ones; dollars are low, expected, high, or None: unknown, never 0. minutes: of these calls alone;
     paced_minutes: at the pace of their account, which all its calls share. queued_minutes: if a server of this
@@ -58,7 +58,7 @@ class Forecast:
 
 
 def experience(totals: Iterable[Totals]) -> Experience:
-    """Return means over one participant's ledger rows."""
+    """Return the mean tokens and seconds of one participant's ledger rows."""
     sum_of_totals = Totals()
     for part in totals:
         sum_of_totals.join(part)
@@ -66,7 +66,7 @@ def experience(totals: Iterable[Totals]) -> Experience:
 
 
 def forecast(entry: Entry, calls: int, seen: Experience, items: Mapping[str, int] = MappingProxyType({})) -> Forecast:
-    """Forecast new calls; the high end is what a budget reserves. items: their number by dataset, for clips' sizes."""
+    """Return the forecast of new calls; the high end is what a budget reserves. items: their number by dataset."""
     frames, most_frames = _clip_tokens(entry, items)
     prompt = seen.prompt_tokens or frames + TYPICAL_TEXT_BYTES / TYPICAL_BYTES_A_TOKEN
     completion = seen.completion_tokens or entry.expected_completion_tokens
@@ -100,7 +100,7 @@ def forecast(entry: Entry, calls: int, seen: Experience, items: Mapping[str, int
 
 
 def remember_latencies(entry: Entry, base_url: str | None, seconds: Sequence[float]) -> None:
-    """Keep how long the calls of a live check took, which were sent at once, for plans of any study."""
+    """Store how long the calls of a live check took, which were sent at once, for plans of any study."""
     means = sum(seconds) / len(seconds), max(seconds) / len(seconds)
     with suppress(OSError):  # a plan can do without
         write_text(user_cache() / _LATENCIES, json.dumps(_latencies() | {_address(entry, base_url): means}))
@@ -119,7 +119,7 @@ def _address(entry: Entry, base_url: str | None) -> str:
 
 
 def minutes_of(forecasts: Iterable[Forecast]) -> float:
-    """Return parallel calls' minutes: the slowest participant's, or an account's pace."""
+    """Return the minutes of calls sent in parallel: the slowest participant's, or at an account's pace."""
     rows, minutes_by_account = list(forecasts), dict[str, float]()
     for row in rows:
         minutes_by_account[row.account] = minutes_by_account.get(row.account, 0.0) + row.paced_minutes

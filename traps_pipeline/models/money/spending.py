@@ -35,7 +35,7 @@ def open_budget(workspace: Workspace, participants: Iterable[Entry]) -> Iterator
 
 @contextmanager
 def share_accounts(workspace: Workspace, participants: Iterable[Entry]) -> Iterator[Callable[[str], int]]:
-    """Announce which accounts this process uses; yield a counter of an account's processes."""
+    """Announce which accounts this process uses; yield a function that counts an account's processes."""
     accounts = {entry.account for entry in participants if entry.account}
     if not accounts:
         yield lambda account: 1
@@ -45,7 +45,7 @@ def share_accounts(workspace: Workspace, participants: Iterable[Entry]) -> Itera
 
 
 def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[str, AccountBudget]:
-    """Return `study.yaml`'s account budgets by participant. Raises TrapsError."""
+    """Return by participant the account budgets that `study.yaml` names. Raises TrapsError."""
     study, budgets = workspace.study, dict[str, AccountBudget]()
     entries: list[Entry] = [*load_models().values(), *load_judges().values()]
     for account, folder in study.account_budgets.items():
@@ -62,7 +62,7 @@ def account_budgets(workspace: Workspace, spent: Mapping[str, float]) -> dict[st
 
 
 def releasable(workspace: Workspace) -> dict[str, Releasable]:
-    """Return the releasable dollars by participant. Raises TrapsError."""
+    """Return by participant the reserved dollars that may be released. Raises TrapsError."""
     with workspace.ledger.writing():
         return Money(workspace.ledger).releasable()
 

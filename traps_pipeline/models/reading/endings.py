@@ -45,5 +45,5 @@ _ENDINGS: Mapping[str, Ending] = {reason: ending for ending, reasons in _REASONS
 
 
 def ending_of(reason: str | None) -> Ending:
-    """Return the meaning of a finish reason; `unknown` for an undocumented one."""
+    """Return the kind of ending that a finish reason means; `unknown` for an undocumented one."""
     return _ENDINGS.get((reason or "").strip().lower(), "unknown")

@@ -12,7 +12,7 @@ ROUNDING = 1e-3  # above 0, which some providers round a certain token to
 
 
 def first_token_logprobs(logprobs: Any) -> dict[str, float]:
-    """Return the alternatives for the first token that contains a letter or a digit.
+    """Return log-probabilities by token, at an answer's first token with a letter or a digit.
 
     Quotes, stars and white space begin no answer. logprobs: the field of a choice in OpenAI's chat API; the result is
     empty without it.
@@ -24,7 +24,7 @@ def first_token_logprobs(logprobs: Any) -> dict[str, float]:
 
 
 def stored_alternatives(alternatives: Mapping[str, float], regime: object) -> str | None:
-    """Return alternatives as stored, likeliest first; None if the regime uses none."""
+    """Return first tokens' log-probabilities as stored text, likeliest first; None if the regime uses none."""
     if not alternatives or regime not in BY_NAME or not BY_NAME[str(regime)].first_token:
         return None
     top_alternatives = sorted(alternatives.items(), key=lambda one: -one[1])[

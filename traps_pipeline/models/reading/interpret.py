@@ -41,7 +41,7 @@ _TOKEN_CHARACTERS = 128  # of the longest token in any usual vocabulary
 
 @dataclass(frozen=True)
 class Reading:
-    """An answer as the reader of raw texts understands it.
+    """The interpretation of an answer's raw text.
 
     outcome: as in the ledger, or `degenerate`; text: for judges, None if they are shown nothing; reasoning: the trace;
     is_json: whether the text is the requested object, if one was requested; why: what is wrong with a text that is no
@@ -150,7 +150,7 @@ def _skip(text: str, place: int, sign: str = "") -> int:
 
 
 def degenerate(text: str) -> str | None:
-    """Return why a text says nothing (no letter or digit, or repetition), else None.
+    """Return in words why a text says nothing (no letter or digit, or repetition), else None.
 
     A text repeats itself if a unit of at most 40 words occurs at least six times in a row at its end and makes up at
     least half of its words, or if 30 characters or more are of at most two kinds.

@@ -67,7 +67,7 @@ def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_flag(value: object) -> object:
-    """Return a word for a truth value (`"true"`) as a bool; anything else unchanged."""
+    """Return a truth value from a word (`"true"`); anything else unchanged."""
     return {"true": True, "false": False}.get(value.strip().lower(), value) if isinstance(value, str) else value
 
 
@@ -80,7 +80,7 @@ def words_of(text: str) -> str:
 
 
 def named_choices(text: str, answer_type: str, labels: Sequence[str], aliases: Mapping[str, str]) -> set[str]:
-    """Return the choices that a value names: one is its choice; of several none can be read.
+    """Return the choices that a value names; a value that names several cannot be read.
 
     The longest names count, wherever they stand; a numeric value also names each number in it, and "2 of 3" names 2
     alone. Where a word outside of a name denies something, or a number counts from the right, every choice is returned.
@@ -124,7 +124,7 @@ def _value_words(text: str) -> list[str]:
 
 
 def to_label(text: str, labels: Sequence[str], aliases: Mapping[str, str]) -> str | None:
-    """Return the only label that a value names; else None."""
+    """Return the label that a value names; None if it names none or several."""
     named = named_choices(text, "", labels, aliases)
     return named.pop() if len(named) == 1 else None
 

@@ -27,7 +27,7 @@ _TURN = re.compile(r"<\|start\|>assistant|<\|(?:start|end|return)\|>")  # gpt-os
 
 @dataclass(frozen=True)
 class ThinkingSplit:
-    """A text split into thinking and answer; `is_open` if it ends in its thinking."""
+    """A text split into the model's thinking and its answer; `is_open` if it ends in its thinking."""
 
     thinking: str
     answer: str
@@ -35,7 +35,7 @@ class ThinkingSplit:
 
 
 def marks_of(declared: str | Sequence[str]) -> Marks:
-    """Parse declared marks: both, or a common opening one. Raises ValueError."""
+    """Return the opening and closing mark of declared thinking: both, or a common opening one. Raises ValueError."""
     closing_mark_of = dict(COMMON_MARKS)
     if isinstance(declared, str) and declared in closing_mark_of:
         return declared, closing_mark_of[declared]
@@ -47,7 +47,7 @@ def marks_of(declared: str | Sequence[str]) -> Marks:
 
 
 def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
-    """Split a text's thinking from its answer; without marks all of it is the answer.
+    """Return a text split into thinking and answer; without marks all of it is the answer.
 
     A closing mark without an opening one ends thinking that began with the text: some chat templates open it
     themselves.
@@ -71,7 +71,7 @@ def split_thinking(text: str, marks: Marks | None) -> ThinkingSplit:
 
 
 def strip_tokens(text: str) -> str:
-    """Remove trailing end-of-sequence tokens, and invisible characters around a text."""
+    """Return a text without trailing end-of-sequence tokens, and without invisible characters around it."""
     text = text.strip(_INVISIBLE)
     end, has_token = len(text), False
     while True:
@@ -93,7 +93,7 @@ def strip_fence(text: str) -> str:
 
 
 def undeclared_mark(text: str) -> str | None:
-    """Return the opening mark of the first common pair in a text, if any."""
+    """Return the opening mark of the first common pair around thinking in a text; None if there is none."""
     lower = text.lower()
     return next(
         (
@@ -106,5 +106,5 @@ def undeclared_mark(text: str) -> str | None:
 
 
 def declaration_line(mark: str) -> str:
-    """Return the line of an entry that declares a common mark."""
+    """Return the line of YAML that declares a common mark in an entry."""
     return f"thinking: {json.dumps(mark, ensure_ascii=False)}"

@@ -1,4 +1,4 @@
-"""Declare what an entry shares or repeats: limits of calls, an account, prices, groups."""
+"""Declare settings that entries share or repeat: limits of calls, an account, prices, groups."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import datetime
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from traps_pipeline.base.keys import Address, Variable, read_key
-from traps_pipeline.base.redaction import hide
+from traps_pipeline.base.redaction import redact_environment_variable
 
 
 class Limits(BaseModel):
-    """Limits of calls to a participant; none of them is in the ledger key."""
+    """The limits of calls to a participant; none of them is in the ledger key."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     concurrency: int = Field(default=24, ge=1, description="calls at once")
@@ -35,7 +35,7 @@ class Account(BaseModel):
     @model_validator(mode="after")
     def _is_redacted(self) -> Account:
         if self.key is not None:
-            hide(self.key)
+            redact_environment_variable(self.key)
         return self
 
     def secret(self) -> str | None:
@@ -57,7 +57,7 @@ class Prices(BaseModel):
 
 
 class Groups(BaseModel):
-    """A model's groups in the paper, by which tables select rows."""
+    """The groups of a model in the paper, by which tables select rows."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     family: str

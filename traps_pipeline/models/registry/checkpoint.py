@@ -33,7 +33,7 @@ class Checkpoint:
 
 
 def as_folder(name: str) -> Path | None:
-    """Return a `checkpoint:` folder, relative to the checkout; None for a hub id."""
+    """Return the path of a `checkpoint:` folder, relative to the checkout; None for a hub id."""
     folder = ROOT / name
     return folder if folder.is_dir() or not _HUB_ID.fullmatch(name) else None
 

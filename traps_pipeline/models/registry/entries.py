@@ -118,7 +118,7 @@ class Entry(BaseModel):
         return int(self.params.get("max_tokens") or self.params.get("max_completion_tokens") or 0)
 
     def protocol(self) -> Protocol:
-        """Return the protocol's parameters for such a participant, with names and values."""
+        """Return the parameters that the protocol fixes for such a participant, with names and values."""
         return PROTOCOL_PARAMS
 
     def _check_waivers(self, protocol: Protocol) -> None:
@@ -227,7 +227,7 @@ class ModelEntry(Entry):
 _Entry = TypeVar("_Entry", bound=Entry)
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def _parse(path: Path) -> Any:
     """Return a registry's YAML, from which models and accounts are read in turn."""
@@ -272,7 +272,7 @@ def with_user_entries(entries: dict[str, _Entry], key: user_registry.Kind, kind:
     return entries
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     """Return models by id, in file order. Raises TrapsError naming entry and field."""
@@ -280,7 +280,7 @@ def load_models(path: Path = MODELS_FILE) -> dict[str, ModelEntry]:
     return with_user_entries(models, "models", ModelEntry) if path == MODELS_FILE else models
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_accounts(path: Path = MODELS_FILE) -> dict[str, Account]:
     """Return accounts by name. Raises TrapsError naming account and field."""
@@ -327,7 +327,7 @@ def answering_version(evaluation: Evaluation) -> str:
 
 
 def missing_keys(entries: Iterable[Entry]) -> dict[str, list[str]]:
-    """Return the variables of keys that are not set, with the entries that need them."""
+    """Return the key variables that are not set, each with the ids of entries that need it."""
     accounts = load_accounts()
     missing: dict[str, list[str]] = {}
     for entry in entries:
@@ -353,12 +353,12 @@ def is_reference(model_id: str) -> bool:
 
 
 def reference_rows() -> list[str]:
-    """Return ids of the registry's strategies and rules: rows to compare with, which no text calls models."""
+    """Return the ids of the registry's strategies and rules: rows to compare with, which no text calls models."""
     return [*filter(is_reference, load_models())]
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def local_models() -> tuple[str, ...]:
-    """Return models whose hidden states can be read, in file order."""
+    """Return the ids of the models whose hidden states can be read, in file order."""
     return tuple(entry.id for entry in load_models().values() if entry.backend == LOCAL)

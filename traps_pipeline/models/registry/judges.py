@@ -61,7 +61,7 @@ _WITH_PREMISE = structured_output("abstention", **_ABSTENTION, rejects_premise={
 
 
 class Judge(typing.Protocol):
-    """The properties of a judge that decide its votes, wherever it is defined."""
+    """The properties of a judge that decide its votes, whether of the registry or of a package."""
 
     @property
     def id(self) -> str:
@@ -70,7 +70,7 @@ class Judge(typing.Protocol):
 
     @property
     def backend(self) -> str:
-        """Where the judge answers: over the network, by rules, or in a package's way."""
+        """The kind of backend that answers: over the network, by rules, or of an installed package."""
         ...
 
     @property
@@ -85,17 +85,17 @@ class Judge(typing.Protocol):
 
     @property
     def thinking(self) -> Marks | None:
-        """The marks of its thinking, which is split off a vote."""
+        """The opening and closing mark around its thinking, which is split off a vote; None if it shows none."""
         ...
 
     @property
     def premise(self) -> bool:
-        """Whether it also says if an answer rejects the question's premise."""
+        """Whether the judge also says if an answer rejects the question's premise."""
         ...
 
 
 def vote_prompt(seat: Judge, task: Task) -> str:
-    """Return a task's system prompt: the paper's, and ours about the premise if asked."""
+    """Return a task's system prompt: the paper's, and ours about the premise if the judge is asked."""
     text = load_prompt(f"judge_{task}")
     return f"{text}\n\n{load_prompt('judge_premise_suffix')}" if seat.premise and task == "abstention" else text
 
@@ -127,7 +127,7 @@ class JudgeEntry(Entry):
         return JUDGE_PROTOCOL
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
     """Return judges by id. Raises TrapsError naming judge and field."""
@@ -136,12 +136,12 @@ def load_judges(path: Path = JUDGES_FILE) -> dict[str, JudgeEntry]:
 
 
 def thinking_of(judge: str) -> Marks | None:
-    """Return the marks of a judge's thinking; None if it shows none."""
+    """Return the opening and closing mark around a judge's thinking; None if it shows none."""
     entry = load_judges().get(judge)
     return entry.thinking if entry else None
 
 
-@user_registry.cached_registry
+@user_registry.clear_on_new_entries
 @cache
 def load_panel(name: str, path: Path = JUDGES_FILE) -> tuple[JudgeEntry, ...]:
     """Return a panel's judges (three, or one). Raises TrapsError naming the file."""
@@ -170,7 +170,7 @@ def is_of_rules(panel: str) -> bool:
 
 
 def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
-    """Return every panel's judges, unchecked. Raises TrapsError without `panels:`."""
+    """Return each panel's judges by the panel's name, unchecked. Raises TrapsError without `panels:`."""
     panels = read_mapping(path).get("panels")
     if not isinstance(panels, dict):
         raise TrapsError(f"{path}: must hold a mapping `panels:`")
@@ -178,7 +178,7 @@ def load_panels(path: Path = JUDGES_FILE) -> dict[str, Any]:
 
 
 def panel_advice(path: Path = JUDGES_FILE) -> str:
-    """Return instructions for a command without a panel."""
+    """Return a sentence that says how to name a panel, for a command without one."""
     return (
         f"write `panel: NAME` into the experiment, or say --panel NAME; {path} has {', '.join(load_panels(path))} "
         f"({RULES_PANEL} is for reference strategies)"

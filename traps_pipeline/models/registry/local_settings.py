@@ -58,7 +58,7 @@ class NetworkSize(BaseModel):
 
 
 class MechanismSpec(BaseModel):
-    """Overrides for mechanistic analyses (docs/spec.md 7.1); None: as in `params`."""
+    """Overrides of a local model's settings for mechanistic analyses (docs/spec.md 7.1); None: as in `params`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     quantisation: Quantisation | None = None
@@ -74,7 +74,7 @@ class MechanismSpec(BaseModel):
         return self
 
     def inside(self, params: LocalParams) -> LocalParams:
-        """Return the parameters for mechanistic analyses."""
+        """Return the model's parameters with the overrides."""
         if self.quantisation in (None, params.quantisation) and not self.nf4_skip:
             return params
         return params.model_copy(update={"quantisation": self.quantisation, "nf4_skip": self.nf4_skip})

@@ -38,7 +38,7 @@ def system_prompt(regime: str, dataset: str = "") -> str:
 
 @cache
 def vqa_prompt(name: str) -> str:
-    """Return a prompt of VQA_PROMPTS, used for hidden states (docs/spec.md 7.1)."""
+    """Return the text of a prompt of VQA_PROMPTS, used for hidden states (docs/spec.md 7.1)."""
     return "\n\n".join(load_prompt(part) for part in BY_NAME[name].states)
 
 

@@ -33,7 +33,7 @@ Cached = TypeVar("Cached")
 
 
 class UserRegistry(BaseModel):
-    """An experiment's or workspace's additions to the registries, which may be short."""
+    """The additions of an experiment or a workspace to the registries, which may be short."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     accounts: dict[Name, dict[str, Any]] = {}
@@ -72,7 +72,7 @@ class UserRegistry(BaseModel):
 
     @property
     def all_accounts(self) -> dict[str, dict[str, Any]]:
-        """The accounts, with one for each entry that has its own address."""
+        """The accounts by name, with one for each entry that has its own address."""
         addressed_entries = [entry for entry in (*self.models, *self.judges) if "base_url" in entry]
         accounts = {
             _account(entry): {k: entry[k] for k in ("base_url", "key") if k in entry} for entry in addressed_entries
@@ -84,8 +84,8 @@ _overlay: list[tuple[Path, UserRegistry]] = []  # additions of the command's exp
 _clearers: list[Callable[[], None]] = []  # clear the caches of the registries
 
 
-def cached_registry(cached: Cached) -> Cached:
-    """Decorate a cached registry reader; adding entries clears its cache."""
+def clear_on_new_entries(cached: Cached) -> Cached:
+    """Return a cached registry reader unchanged, and clear its cache when entries are added."""
     _clearers.append(cached.cache_clear)  # pyright: ignore[reportAttributeAccessIssue] - of functools.cache
     return cached
 
@@ -113,7 +113,7 @@ def save_entries(workspace: Workspace) -> None:
 
 
 def registries() -> list[tuple[Path, UserRegistry]]:
-    """Return all additions, each with its file: the workspace's, the experiment's."""
+    """Return all additions, each with the path of its file: the workspace's, the experiment's."""
     path = Workspace.file_of(Workspace.default_place(), FILE) if os.environ.get(VARIABLE) else None
     return [*([(path, _read(path))] if path else []), *_overlay]
 
@@ -127,12 +127,12 @@ def all_additions() -> UserRegistry:
 
 
 def accounts() -> Mapping[str, dict[str, Any]]:
-    """Return the accounts of models that users described, by name."""
+    """Return by name the accounts of models that users described."""
     return all_additions().all_accounts
 
 
 def entries(kind: Kind) -> Iterable[tuple[Path, dict[str, Any]]]:
-    """Return the added models or judges, completed, each with its file."""
+    """Return the added models or judges, completed, each with the path of its file."""
     newest_of = {raw["id"]: (path, raw) for path, registry in registries() for raw in getattr(registry, kind)}
     return ((path, _entry_fields(raw, kind)) for path, raw in newest_of.values())
 

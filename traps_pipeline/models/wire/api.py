@@ -126,7 +126,7 @@ def media_parts(media: Media, route: str) -> list[dict[str, Any]]:
 
 
 def messages(entry: Entry, request: Request) -> list[dict[str, Any]]:
-    """Return system prompt, then clip and question, nothing else (docs/spec.md 3.3)."""
+    """Return the messages of a call: system prompt, then clip and question, nothing else (docs/spec.md 3.3)."""
     user: str | list[dict[str, Any]] = request.user
     if request.sent is not None:
         route = str(entry.provider_id).split("/")[0]
@@ -135,7 +135,7 @@ def messages(entry: Entry, request: Request) -> list[dict[str, Any]]:
 
 
 class ApiBackend:
-    """Asks one entry of the registry through litellm."""
+    """A backend that asks one entry of the registry through litellm."""
 
     def __init__(self, entry: Entry, account: Account | None = None) -> None:
         account = account or load_accounts()[str(entry.account)]
@@ -152,7 +152,7 @@ class ApiBackend:
         self._told: set[str] = set()
 
     async def ask(self, request: Request) -> Outcome:
-        """Return the outcome of one attempt; see `Backend`."""
+        """Return the outcome of one attempt to answer a request."""
         prompt = messages(self._entry, request)
         _internal_call().set(True)
         with record_exchange() as exchange:

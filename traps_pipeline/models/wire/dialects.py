@@ -37,7 +37,7 @@ _PARTS: Mapping[str, tuple[str, str]] = {
 
 
 class OddShapeError(ValueError):
-    """A body that is not an answer of its dialect; the message describes it."""
+    """Raised for a body that is not an answer of its dialect; the message describes it."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _listed(body: Json, name: str) -> list[dict[str, Any]]:
 
 
 def shape_of(text: str) -> str:
-    """Return a description of a text that is no JSON."""
+    """Return in words what a text is that is no JSON."""
     start = text.lstrip("\ufeff \t\r\n")
     if not start:
         return "an empty body"

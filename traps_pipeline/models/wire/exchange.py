@@ -15,7 +15,7 @@ _NOT_TAKEN = (503, 529)
 
 @dataclass
 class Exchange:
-    """One attempt as seen on the wire.
+    """One attempt to send a call, as seen on the wire: status, headers, body.
 
     sent: whether bytes of the request were handed to a connected server; None if unknown (a backend without a network).
     status, headers (by name in lower case): of the answer. content: its decoded body, None if it was not read to its
@@ -59,7 +59,7 @@ CURRENT_EXCHANGE: ContextVar[Exchange | None] = ContextVar("watched", default=No
 
 @contextmanager
 def record_exchange() -> Iterator[Exchange]:
-    """Record the wire's traffic in the block, in the caller's exchange or a new one."""
+    """Yield a record of the wire's traffic in the block: the caller's exchange or a new one."""
     if (outer := CURRENT_EXCHANGE.get()) is not None:
         yield outer
         return

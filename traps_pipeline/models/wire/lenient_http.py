@@ -23,7 +23,7 @@ _FRAMING = (b"content-length", b"transfer-encoding")
 
 
 class LenientConnector(aiohttp.TCPConnector):
-    """A connector whose connections read answers by `LenientHandler`."""
+    """A connector for aiohttp whose connections read answers by `LenientHandler`."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
@@ -31,7 +31,7 @@ class LenientConnector(aiohttp.TCPConnector):
 
 
 class LenientHandler(ResponseHandler):
-    """Reads the answers of one connection, each with its head rewritten."""
+    """A handler that reads the answers of one connection, each with its head rewritten."""
 
     is_asked = False  # whether a request was sent; what comes before is kept
 
@@ -43,7 +43,7 @@ class LenientHandler(ResponseHandler):
         super().set_response_params(**settings)
 
     def feed_data(self, data: tuple[Any, aiohttp.StreamReader], size: int = 0) -> None:
-        """Hand on an answer, and remember the reader of its body."""
+        """Pass on an answer, and remember the reader of its body."""
         self._body = data[1]
         super().feed_data(data, size)
 

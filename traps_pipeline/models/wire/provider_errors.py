@@ -91,7 +91,7 @@ class ProviderError:
 
     @property
     def is_about_key(self) -> bool:
-        """Whether a 401 or 403 with it is about the key; assumed if it has no words."""
+        """Whether a 401 or 403 with this error is about the key; assumed if it has no words."""
         text = " ".join((self.message, *self.words)).replace("_", " ")
         return not text.strip() or bool(_ABOUT_KEY.search(text))
 

@@ -36,7 +36,7 @@ _REASONING = (
 
 @dataclass(frozen=True)
 class Usage:
-    """Tokens of a call; completion includes the reasoning, which may be unknown.
+    """The tokens of a call; completion includes the reasoning, which may be unknown.
 
     believed: whether the counts are complete and possible; if not, they are the highest of any field.
     """
@@ -49,14 +49,14 @@ class Usage:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Our measure of a call: bytes of prompt text, frames, bytes of returned text."""
+    """The size of a call as measured here: bytes of prompt text, frames, bytes of returned text."""
 
     prompt_bytes: int
     frames: int
     text_bytes: int
 
     def contradict(self, usage: Usage) -> bool:
-        """Return whether a usage is below the minimum for these sizes."""
+        """Return whether a usage is below the minimum for these sizes, so not to be believed."""
         min_tokens = self.prompt_bytes // BYTES_A_TOKEN + self.frames * TOKENS_A_FRAME
         return usage.prompt < min_tokens or usage.completion < -(-self.text_bytes // BYTES_A_TOKEN)
 

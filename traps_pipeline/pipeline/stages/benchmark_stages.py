@@ -33,13 +33,13 @@ category_to_arms = to_keys(CATEGORY, DATASET, arms_of_category)
 
 @_source()
 def released_specs(workspace: Workspace, category: str) -> str:
-    """Return the version of the frozen scenarios under scene_specs/released."""
+    """Return the version (digest) of the frozen scenarios under scene_specs/released."""
     return released_version(workspace, category)
 
 
 @_source()
 def corrections(workspace: Workspace, category: str) -> str:
-    """Return the version of the review decisions under scene_specs/corrections."""
+    """Return the version (digest) of the review decisions under scene_specs/corrections."""
     return corrections_version(workspace, category)
 
 
@@ -100,7 +100,7 @@ _unbalanced = _specs_check("composition.composition_problems")
     ],
 )
 def scene_specs(workspace: Workspace, category: str) -> StageOutput:
-    """Return scenarios of a category after corrections, one row each.
+    """Return a category's scenarios after corrections, one row each.
 
     A scenario with corrected parameters is simulated here, once.
     """
@@ -151,7 +151,7 @@ def _repeated_content(workspace: Workspace, key: str | None, output: StageOutput
     ],
 )
 def videos(workspace: Workspace, category: str) -> StageOutput:
-    """Return control and void clips of a category, one row each.
+    """Return a category's clips, one row each: the control and the void of every scenario.
 
     Each clip is rendered once, from its frozen trajectory, by one of the processes working on the category.
     """
@@ -185,7 +185,7 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
     group="arms",
     parents=[scene_specs, videos, released_specs, corrections],  # records of two events are in no table before
     scheme=CATEGORY,
-    code="5",
+    code="6",
     kinds=["parquet", "mp4"],
     takes=RENDERS,
     shared=ConcurrentBuild(_film, _seconds_of_filming),
@@ -193,7 +193,7 @@ def _lost_arms(workspace: Workspace, category: str) -> list[str]:
     lost=_lost_arms,
 )
 def arms(workspace: Workspace, category: str) -> StageOutput:
-    """Return a category's clips and questions beside the pairs: arms and variations."""
+    """Return a category's clips and questions beside the pairs, one row each: arms and variations."""
     from traps_pipeline.benchmark.filmed_arms import build_arms
 
     rows = build_arms(workspace, category)
@@ -236,7 +236,7 @@ def _odd_pairs(workspace: Workspace, key: str | None, output: StageOutput) -> di
     ],
 )
 def items(workspace: Workspace, dataset: str) -> StageOutput:
-    """Return the items that models are asked, a control and a changed void per pair."""
+    """Return a dataset's questions that models are asked, one row each: on the control and on the void of a pair."""
     from traps_pipeline.benchmark.items import build_items
 
     rows = build_items(workspace, dataset)

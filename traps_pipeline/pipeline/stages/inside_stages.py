@@ -139,7 +139,7 @@ def lens(workspace: Workspace, key: str) -> StageOutput:
 
 @_stage(tables.LEADS, code="2", parents=_COMPARED, wants=lambda _, key: Extraction.parse(key).prompt == PROBE_PROMPT)
 def leads(workspace: Workspace, key: str) -> StageOutput:
-    """Return how states and rivals order each dataset's sides, of the model and its controls."""
+    """Return how well states and rivals order each dataset's sides, in the model and its controls."""
     from traps_pipeline.mechanism.leads import lead_rows
 
     return StageOutput(lead_rows(workspace, *_model_and_states(workspace, key)))
@@ -163,7 +163,7 @@ def _with_two_events(key: str) -> list[str]:
     wants=lambda study, key: StatesCell(TWO_EVENTS, Extraction.parse(key)).key in study.states,
 )
 def interaction(workspace: Workspace, key: str) -> StageOutput:
-    """Return whether states of two events tell, within a clip, that the asked event is hidden."""
+    """Return how well states of two events tell, within a clip, that the asked event is hidden."""
     from traps_pipeline.mechanism.interaction import interaction_rows
 
     return StageOutput(interaction_rows(workspace, *_model(workspace, key)))

@@ -76,7 +76,7 @@ def steering_settings(workspace: Workspace, key: str) -> str:
 
 
 def steers(partitions: StudyPartitions, key: str | None) -> bool:
-    """Return whether the study steers models, along directions of the model's own weights."""
+    """Return whether the study steers models: adds directions of a model's own to its hidden states."""
     return partitions.steers and (key is None or Extraction.parse(key).weights_seed is None)
 
 

@@ -157,7 +157,7 @@ def leaderboard(workspace: Workspace, _: None) -> StageOutput:
     ],
 )
 def two_way(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return whether abstention follows the asked event or the other one, by model and regime.
+    """Return by model and regime how far abstention follows the asked event, or the other one.
 
     The table is empty if no two events, and nothing that must be inferred, were asked.
     """
@@ -207,7 +207,7 @@ def hypotheses(workspace: Workspace, _: None) -> "pd.DataFrame":
     ],
 )
 def graded(workspace: Workspace, _: None) -> "pd.DataFrame":
-    """Return what models earn on graded cuts, by the true distribution over answers.
+    """Return the points that models earn on graded cuts, by the true distribution over answers.
 
     The table is empty if no graded cut was run.
     """

@@ -1,4 +1,4 @@
-"""Order a study's answers, decisions and votes as the explorer shows them.
+"""Split a study's answers, decisions and votes into the data files of the explorer.
 
 Every answer has a row: sorted by item, then by evaluation. Items are sorted so that those of a pair, and the pairs of a
 family, follow each other; a shard holds the texts and votes of consecutive pairs, so that a page of one pair needs one
@@ -96,7 +96,7 @@ def study_items(workspace: Workspace) -> pd.DataFrame:
 
 
 def study_answers(workspace: Workspace) -> StudyAnswers:
-    """Return answers to current items, with votes. Raises TrapsError without items."""
+    """Return a study's answers to its current items, with votes. Raises TrapsError without items."""
     items = study_items(workspace)
     responses = _item_rows(workspace, RESPONSES, ("outcome", "epoch", *_TEXTS), items)
     evaluations = _evaluations(responses)

@@ -23,7 +23,7 @@ def answer_of_control(spec: Mapping[str, Any]) -> str:
 
 
 def intervention(spec: Mapping[str, Any]) -> str:
-    """Return how the control's clip was changed to make the void."""
+    """Return in words how the void was made from the control: hidden or cut at a time, or another clip."""
     moment = f"{spec['void_from_s']:.1f} s"
     if spec["family"] == RECORDED and not json.loads(spec["void"]).get("cover") and spec["void_kind"] == "occluder":
         return "another clip"
@@ -48,7 +48,7 @@ _PHRASES = {
 
 
 def certificate_phrases(evidence: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield name and description of each number that supports the certificates."""
+    """Yield the name, and the value in words, of each number that supports a scenario's certificates."""
     for name, phrase in _PHRASES.items():
         if evidence.get(name) is not None:
             value = in_percent(evidence[name]) if name in _SHARES else evidence[name]

@@ -329,7 +329,7 @@ def _digest(contents: Mapping[str, Mapping[str, Any]]) -> str:
 
 @cache
 def script() -> str:
-    """Return bundled libraries and our sources. Raises TrapsError if a bundle changed."""
+    """Return the text of the explorer's script, libraries included. Raises TrapsError if a library was changed."""
     library = LIBRARY.read_bytes()
     expected_sha256 = LIBRARY.with_name("parquet.js.sha256").read_text(encoding="ascii").split()[0]
     if hashlib.sha256(library).hexdigest() != expected_sha256:
@@ -339,7 +339,7 @@ def script() -> str:
 
 
 def index_page(workspace: Workspace, stamp: str, clips_at: str = "", *, report: bool = False) -> str:
-    """Return the index, which may load only scripts and clips of its own folder."""
+    """Return the explorer's HTML page, which may load only scripts and clips of its own folder."""
     style = (WEB / "style.css").read_text(encoding="utf-8")
     digest = b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     return environment(WEB).get_template("index.html.j2").render(
@@ -360,7 +360,7 @@ def parquet_text(table: pa.Table) -> str:
 
 
 def data_script(name: str, version: str, content: Mapping[str, Any]) -> bytes:
-    """Return the script of one data file, which calls the page's `TRAPS_DATA`.
+    """Return a data file's JavaScript, which passes its content to the page's function `TRAPS_DATA`.
 
     version: version of the whole site, so that a page never mixes files of two. content: JSON values; Parquet is
     `parquet_text`.

@@ -17,7 +17,7 @@ SAME_POINT = 0.018  # maximum distance, as a share of the axes, at which models 
 
 @dataclass(frozen=True)
 class Label:
-    """The label of one point in (Acc, J), with the names of the models there."""
+    """The label of a point in the plane of Acc and J, with the names of the models at that point."""
 
     x: float
     y: float
@@ -39,7 +39,7 @@ def merge_labels(labels: Sequence[Label], axes: Axes) -> list[Label]:
 
 
 def place_labels(axes: Axes, labels: Sequence[Label], markers: np.ndarray) -> None:
-    """Put every label near its point, clear of labels and markers and mostly of lines.
+    """Draw every label near its point, clear of labels and markers and mostly of lines.
 
     A leader line connects a label to its point if they are apart, or if several names share a point. markers: (n, 2),
     data units.
@@ -118,6 +118,6 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def short(model: str) -> str:
-    """Return a label's text without line breaks, shortened to 28 characters."""
+    """Return a label's text in one line, shortened to 28 characters."""
     text = "".join(c if c.isprintable() else "?" for c in model)
     return text if len(text) <= 28 else text[:27] + "…"

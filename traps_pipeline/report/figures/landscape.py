@@ -11,7 +11,7 @@ import numpy as np
 from traps_pipeline.models.registry.entries import reference_rows
 from traps_pipeline.protocol.regimes import BY_NAME, GUIDED, PROMPTING, REGIMES, STANDARD
 from traps_pipeline.report.figures.label_placement import LINES, Label, merge_labels, place_labels, short
-from traps_pipeline.report.figures.looks import arrow, frame_plane, legend_key, looks, model_family
+from traps_pipeline.report.figures.looks import arrow, legend_key, looks, model_family, set_j_accuracy_axes
 from traps_pipeline.report.result_frames import Results, datasets_of
 from traps_pipeline.report.terms import INCOMPLETE_MARK, TITLE_OF
 from traps_pipeline.report.writing import COLUMN_IN, INK, PAGE_IN, NotRun, figure_style, freeze_layout, new_figure
@@ -52,7 +52,7 @@ def landscape_figure(points: pd.DataFrame, scope: str) -> Figure:
     with figure_style():
         figure = new_figure(COLUMN_IN, 3.7)
         axes = figure.add_subplot()
-        frame_plane(axes, points, f"Acc, {scope.lower()}", intervals=True)
+        set_j_accuracy_axes(axes, points, f"Acc, {scope.lower()}", intervals=True)
         labels = merge_labels(_plot_models(axes, points), axes)
         guided = points.loc[points["regime"].eq(GUIDED) & ~points["model"].isin(reference_rows())]
         _plot_frontier(axes, guided)
@@ -79,7 +79,7 @@ def reasoning(results: Results) -> Figure:
         labels = [_plot_chains(axes, chain_points.loc[chain_points["regime"] == regime], chains) for axes, regime in
                   zip(panels, PROMPTING, strict=True)]  # fmt: skip
         for axes, regime in zip(panels, PROMPTING, strict=True):
-            frame_plane(axes, chain_points, "Acc, overall")
+            set_j_accuracy_axes(axes, chain_points, "Acc, overall")
             axes.set_title(f"{regime} (filled: thinks most)", weight="normal", size=7.5)
         panels[1].set_ylabel("")
         freeze_layout(figure)

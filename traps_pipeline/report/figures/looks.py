@@ -46,7 +46,7 @@ def looks(models: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {m: (colours[m], MARKERS[models_by_colour[colours[m]].index(m) % len(MARKERS)]) for m in models}
 
 
-def frame_plane(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
+def set_j_accuracy_axes(axes: Axes, points: pd.DataFrame, ylabel: str, *, intervals: bool = False) -> None:
     """Set axes of J and accuracy that hold all points, and draw contours of PECS.
 
     At least half of each axis is shown. intervals: whether the limits include the points' 95 % intervals.
@@ -90,7 +90,7 @@ def _limits(values: np.ndarray, low: float, least: float) -> tuple[float, float]
 
 
 def legend_key(label: str, colour: str, marker: str = "", line: Any = "none", size: float = 4, **look: Any) -> Line2D:
-    """Return an entry of a legend: a marker of some size, a line, or both."""
+    """Return an entry of a figure's legend: a marker of some size, a line, or both."""
     from matplotlib.lines import Line2D
 
     return Line2D([], [], label=label, color=colour, marker=marker, linestyle=line, markersize=size, **look)
@@ -106,5 +106,5 @@ def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], colo
 
 
 def range_text(low: int, high: int) -> str:
-    """Return `5`, or `5 to 16`."""
+    """Return a range of whole numbers as text: `5`, or `5 to 16`."""
     return f"{low}" if low == high else f"{low} to {high}"

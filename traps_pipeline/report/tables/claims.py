@@ -39,12 +39,12 @@ TEXTUAL = tuple(name for name in DATASETS if is_ill_posed(name))
 
 
 class TwoModels(Exception):
-    """A metric joins the states of one model with the answers of another."""
+    """Raised where a metric would join the states of one model with the answers of another."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim about a model's inside.
+    """A claim about a model's hidden states: the metric that decides it, and controls in which it must fail.
 
     metric: what is measured; it holds from `bound` on. of: the metric of a model and subject, None where the study has
     none, NaN where the subject's states do not vary; of RIVAL, in a claim of a lead, what is subtracted. fails_in: the
@@ -393,6 +393,6 @@ def _claims(results: Results) -> PrintedTable:
 
 
 def claim_cells(rows: pd.DataFrame, subject: str) -> list[str]:
-    """Return a subject's printed metrics, or the words that stand in their place."""
+    """Return a subject's printed metrics, one text a row, or the words that stand in their place."""
     metrics = zip(rows[f"in_{subject}"], rows[f"why_{subject}"], strict=True)
     return [why or fraction(value) for value, why in metrics]

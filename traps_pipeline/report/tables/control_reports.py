@@ -181,7 +181,7 @@ OTHER_GATES = ("question words", "first frame", "all frames", "length", "time st
 
 
 def lead_rows(results: Results) -> pd.DataFrame:
-    """Return a row by model, subject and target, with the AUROC of each kind of features."""
+    """Return a frame with a row by model, subject and target, with the AUROC of each kind of features."""
     rows, keys = results.leads, ["model", "subject", "target"]
     rows = rows.astype(dict.fromkeys((*keys, "features"), object))
     own = rows.loc[rows["features"] == STATES, [*keys, "layer", "low", "high", "rival", "lead", "lead_low", "lead_high",
@@ -191,7 +191,7 @@ def lead_rows(results: Results) -> pd.DataFrame:
 
 
 def leads(results: Results) -> PrintedTable:
-    """Return what states and rivals tell of each dataset, in the model and in its controls."""
+    """Return the table of how well states and rivals tell each dataset's voids, in the model and its controls."""
     rows = lead_rows(results)
     rows = rows.assign(dataset=short_names(rows["target"]))
     rivals = [name for name in OTHER_GATES if name in rows]

@@ -16,7 +16,7 @@ WHY_EMPTY = "graded cuts were not asked (name `graded` under datasets)"
 
 
 def graded(results: Results) -> list[PrintedTable]:
-    """Return expected points of each model on graded cuts, and its losses.
+    """Return expected points of each model on clips cut at graded times, and its losses by reason.
 
     Losses are by ignorance, by rash answers and by needless abstention.
     """

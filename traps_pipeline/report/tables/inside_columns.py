@@ -38,14 +38,14 @@ BASELINE_NOTES = (
 
 
 def why_not(results: Results, of_paper: str = "") -> str:
-    """Return why a mechanistic frame has no rows; of_paper: why the paper's has none."""
+    """Return in words why a mechanistic frame has no rows; of_paper: why the paper's has none."""
     if of_paper and not results.is_study:
         return of_paper
     return NO_MECHANISM if results.is_study and results.mechanism is None else results.why("probes")
 
 
 def few_marks(rows: pd.DataFrame, *counts: str) -> list[str]:
-    """Return each row's mark: a dagger if a known count is below FEW, else empty."""
+    """Return a mark for each row: a dagger if a known count is below FEW, else an empty text."""
     import pandas as pd
 
     numbers = [pd.to_numeric(rows[name], errors="coerce") for name in counts]
@@ -53,7 +53,7 @@ def few_marks(rows: pd.DataFrame, *counts: str) -> list[str]:
 
 
 def few_note(rows: pd.DataFrame, *marks: str, of: str = "controls or voids") -> list[str]:
-    """Return the mark's meaning if a row has it; `of` names the counted things."""
+    """Return the note that explains the dagger if a row has it; `of` names the counted things."""
     has_mark = any((rows[name] == FEW_MARK).any() for name in marks or ("mark",) if name in rows)
     return [f"{FEW_MARK} fewer than {FEW} {of}: the value says little"] if has_mark else []
 
@@ -65,7 +65,7 @@ def joined_notes(rows: pd.DataFrame) -> list[str]:
 
 
 def interval(prefix: str = "", unit: str = "fraction", digits: int | None = None) -> list[Column]:
-    """Return the columns of the ends of an interval, `low` and `high` with a prefix."""
+    """Return two columns, the ends of an interval; their fields are `low` and `high` with a prefix."""
     return [
         Column(f"{prefix}{end}", word, unit, digits)  # pyright: ignore[reportArgumentType] - a Unit
         for end, word in (("low", "from"), ("high", "to"))
@@ -78,12 +78,12 @@ def short_names(names: Iterable[str]) -> list[str]:
 
 
 def path_names(rows: pd.DataFrame) -> list[str]:
-    """Return the path of each row, from its source to its target."""
+    """Return the steering path of each row as text, from its source to its target."""
     return [path_name(source, target) for source, target in zip(rows["source"], rows["target"], strict=True)]
 
 
 def by_features(results: Results) -> pd.DataFrame:
-    """Return the value of each feature and noise_spread, one row per AT."""
+    """Return the metric of each kind of features and its noise_spread as columns, one row per PROBE_KEY."""
     import pandas as pd
 
     rows = results.baselines
@@ -94,7 +94,7 @@ def by_features(results: Results) -> pd.DataFrame:
 
 
 def best_baselines(results: Results, analysis: str) -> pd.DataFrame:
-    """Return BESIDE by model, source and target: best raw input, margin and noise."""
+    """Return a frame of BESIDE by model, source and target: best raw input, margin and noise."""
     import pandas as pd
 
     rows = by_features(results)

@@ -66,7 +66,7 @@ def with_titles(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def combined_counts(sides: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return COUNTED of a comparison: fewest pairs and runs, sum of missing items."""
+    """Return the counts (COUNTED) of a comparison: fewest pairs and runs, sum of missing items."""
     if not sides:
         return dict.fromkeys(COUNTED)
     counts = {name: min(side[name] for side in sides) for name in ("n_pairs", "n_runs")}
@@ -85,7 +85,7 @@ def with_counts(rows: pd.DataFrame, entries: pd.DataFrame, sides: Sequence[Seque
 
 
 def entries(results: Results) -> pd.DataFrame:
-    """Return the cells, followed by the overall rows with the dataset `overall`."""
+    """Return rows of (model, dataset, regime): each dataset's, then those of `overall`."""
     import pandas as pd
 
     return pd.concat([results.cells, results.overall.assign(dataset="overall")], ignore_index=True)
@@ -97,7 +97,7 @@ def mark_notes(rows: pd.DataFrame) -> list[str]:
 
 
 def meanings(marks: Iterable[str]) -> list[str]:
-    """Return a note for each mark (‡, §, ...), once."""
+    """Return a note that explains each of the marks (‡, §, ...), once."""
     used_marks = set(marks)
     return [f"{mark} {meaning}" for mark, meaning in MARKS.items() if mark in used_marks]
 
@@ -131,7 +131,7 @@ def best_first(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def sort_rows(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Return rows sorted by columns; datasets, regimes, models in their own order."""
+    """Return the rows sorted by columns; datasets, regimes and models in their own order, not by letters."""
     orders: dict[str, Sequence[str]] = {"dataset": [*DATASETS, "overall"], "regime": REGIMES, "model": [*load_models()]}
 
     def place(values: pd.Series) -> pd.Series:
@@ -142,13 +142,13 @@ def sort_rows(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 
 def interval(row: Mapping[str, Any]) -> str:
-    """Return the interval of PECS as printed; empty if there is none."""
+    """Return the interval of a row's PECS as printed; empty if there is none."""
     low, high = row.get("pecs_ci_low"), row.get("pecs_ci_high")
     return "" if low != low or low is None else f"[{fraction(low)}, {fraction(high)}]"
 
 
 def ranks(row: Mapping[str, Any]) -> str:
-    """Return the range of ranks that contrasts do not separate, as printed."""
+    """Return the range of a row's ranks that contrasts do not separate, as printed."""
     import pandas as pd
 
     low, high = row.get("rank_low"), row.get("rank_high")
@@ -156,14 +156,14 @@ def ranks(row: Mapping[str, Any]) -> str:
 
 
 def frame(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
-    """Return the rows as a frame; without rows, an empty frame with these columns."""
+    """Return a list of rows as a frame; without rows, an empty frame with these columns."""
     import pandas as pd
 
     return pd.DataFrame(list(rows)) if rows else pd.DataFrame(columns=pd.Index(list(columns)))
 
 
 def rightly_empty(table: PrintedTable, run: bool) -> PrintedTable:
-    """Return the table; if run and without rows, it prints `why`, not "not run"."""
+    """Return the table; if it was computed and has no rows, it prints `why`, not "not run"."""
     return replace(table, none=table.why) if run and not len(table.rows) else table
 
 

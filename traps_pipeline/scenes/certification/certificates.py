@@ -1,4 +1,4 @@
-"""Define the certificates of a pair: promises, evidence and thresholds.
+"""Define the certificates of a pair: what they promise, their evidence and thresholds.
 
 A certificate is one entry of `CERTIFICATES`. From there it is picked up by `resolve` (a draw that loses one is
 rejected, and what it measures goes into the record), by `certify` (all are measured again from the record and its two
@@ -30,7 +30,7 @@ from traps_pipeline.scenes.certification.evidence import (
 from traps_pipeline.scenes.parts.difficulty import DISTRACTOR
 from traps_pipeline.scenes.parts.look import fineness
 from traps_pipeline.scenes.parts.wording import FAR_COLOUR, false_premises, none_as_answer, refutation
-from traps_pipeline.scenes.physics.flexes import flexes, is_carrier
+from traps_pipeline.scenes.physics.flexes import flexes, soft_body_mask
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Scene, flag_of
 from traps_pipeline.scenes.physics.simulate import swept_points
 from traps_pipeline.scenes.picture import checks
@@ -127,7 +127,7 @@ def pair_of(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: 
 
 
 def futures_of(control: World, seed: int, cut: int | None = None) -> ensemble.Futures:
-    """Return the futures of a control to choose a cut by, or to certify the cut."""
+    """Return the simulated futures of a control, to choose a cut by or to certify the cut."""
     first = earliest_cut(control.physics) if cut is None else cut
     alike_px = MAX_DEVIATION_PX / fineness(control.params)
     return ensemble.Futures(control, seed, first=first, alike_px=alike_px, held_s=COMMITTED_BEFORE_END_S)
@@ -193,7 +193,7 @@ def settled_outcome(family: Family, motion: Motion, params: Any) -> Outcome:
 
 
 def settled_answer(world: World) -> str | None:
-    """Return a world's final answer; None if it cannot be certified."""
+    """Return the answer that a world ends in; None if it cannot be certified."""
     try:
         return settled_outcome(world.family, world.motion, world.params).label
     except Rejected:
@@ -326,7 +326,7 @@ IN_FRAME = Certificate(
 def legible_groups(
     family: Family, model: mujoco.MjModel, scene: Scene, motion: Motion, params: Any
 ) -> list[tuple[tuple[str, ...], float]]:
-    """Return geom groups and the pixels that each must show at the control's end."""
+    """Return groups of geoms, each with the pixels that it must show at the control's end."""
     if family.legible is not None:
         return list(family.legible(motion, params))
     return [(decisive_geoms(model, [body]), LEGIBLE_PIXELS) for body in scene.decisive]
@@ -512,7 +512,7 @@ def _referents(pair: Pair) -> Evidence:
     control = pair.control
     assert control.occluder is not None, "a pair with an occluder has an occluder"
     scene, model, fps = control.scene, control.model, control.physics.fps / control.frame_step
-    rigid = np.flatnonzero((model.body_weldid > 0) & ~is_carrier(model))
+    rigid = np.flatnonzero((model.body_weldid > 0) & ~soft_body_mask(model))
     bodies = {*(model.body(int(i)).name for i in rigid), *flexes(model)}
     # Distractors are neither named nor the cause.
     moving_bodies = {body for body in bodies if not body.startswith(DISTRACTOR)}
@@ -619,7 +619,7 @@ def _open(pair: Pair) -> Evidence:
 
 
 def open_from_state(futures: ensemble.Futures, cut: int, claim: Claim) -> Evidence:
-    """Return evidence that the state at a cut leaves the outcome open."""
+    """Return the evidence that the state at a cut leaves the outcome open."""
     counts = {label: n for label, n in futures.after(cut).items() if label is not None}
     n_settled = sum(counts.values())
     return {

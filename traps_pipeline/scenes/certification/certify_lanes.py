@@ -1,4 +1,4 @@
-"""Certify a world of two lanes: what is seen in its four clips, and what never is."""
+"""Certify a world of two lanes: what its four clips show, and what none of them does."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ PX_APART, SHARE_APART = 4.0, 0.02  # that another renderer may count
 
 
 def certify_lane_record(spec: TwoEventsSpec, worlds: Mapping[str, np.ndarray]) -> Verdict:
-    """Certify a record from its trajectories alone; worlds: by name, as its file has them."""
+    """Return the verdict on a record of two events, from its trajectories alone (worlds: by name)."""
     start_s, failures, evidence = time.process_time(), dict[str, str](), dict[str, Any]()
     world, *twins = (spec.world(worlds[name], k) for name, k in (("qpos", None), *((LANES[k], k) for k in range(2))))
     try:
@@ -68,7 +68,7 @@ def _is_alike(value: Any, stored: Any) -> bool:
 
 
 def certify_lanes(world: TwoLanes, twins: Sequence[TwoLanes], every: int = EVERY) -> dict[str, Any]:
-    """Return a world's evidence; twins: the worlds with the twin in the left and in the right lane. Raises Rejected.
+    """Return the evidence of a world of two lanes; twins: the worlds where one lane differs. Raises Rejected.
 
     every: one of so many frames is compared with the twin's. Each lane ends as by itself, and its twin otherwise; a
     window shows the settled outcome; boards pass through nothing; what decides is hidden before that, and the doubles
@@ -93,8 +93,8 @@ def _outcomes(world: TwoLanes, twins: Sequence[TwoLanes]) -> dict[str, Any]:
         if len({outcome.label for outcome, _ in outcomes}) < 2:
             raise Rejected(f"{LANES[k]}: the twin has the same outcome")
         settled.append(max(outcome.commit_frame for outcome, _ in outcomes))
-        if not lane.timetable.shows(settled[-1], len(world.qpos), world.physics.fps):
-            raise Rejected(f"{LANES[k]}: no window of a second shows the settled outcome")
+        if not lane.timetable.shows(settled[-1], len(world.qpos), world.physics.fps, lane.window_s):
+            raise Rejected(f"{LANES[k]}: no window of {lane.window_s:g} s shows the settled outcome")
     return {"settled_frames": settled}
 
 
@@ -135,7 +135,7 @@ def _drawn(world: TwoLanes, names: Sequence[str], every: int) -> dict[str, np.nd
 
 
 def pixels_of(world: TwoLanes, clip: str, geoms: Sequence[str], frames: Sequence[int] | slice) -> np.ndarray:
-    """Return the pixels of some geoms in some frames of a clip, (F, G)."""
+    """Return the number of pixels that each geom shows in some frames of a clip, (F, G)."""
     with Renderer(world.model, world.camera, supersample=1) as renderer:
         return renderer.visible_pixels(world.clip(CLIPS[clip])[frames], geoms)
 

@@ -19,7 +19,7 @@ from traps_pipeline.video.encode import frames_digest
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of certifying a record.
+    """The result of certifying a record: failed certificates, evidence and measurements.
 
     failures: certificate -> why it cannot be given; empty if the record passes. measured: the evidence of all
     certificates. same_physics: whether simulating here gives the frozen trajectory bit by bit. control_end, void_end:
@@ -44,7 +44,7 @@ class Verdict:
 
 
 def certify(spec: SceneSpec, qpos: np.ndarray, twin: np.ndarray, *, frame_step: int = 1) -> Verdict:
-    """Measure and judge all certificates of a record from its trajectories, (F, nq).
+    """Return the verdict on a record: all its certificates, measured from its trajectories, (F, nq).
 
     The measured evidence must also equal the stored evidence. frame_step: pixel certificates look at every so
     many frames (1: full rate; 2: the 5 FPS sample).

@@ -1,4 +1,4 @@
-"""Simulate futures of starts that look like a control up to a cut.
+"""Simulate futures of starts that look like the control of a pair up to a cut.
 
 The initial state is perturbed far below what a pixel shows and simulated on. A rollout counts for a cut while it cannot
 be told from the control by eye. How many must count, and how they must disagree, is the certificate's (`certificates`).
@@ -36,7 +36,7 @@ THREADS = 2
 
 @dataclass(frozen=True)
 class Cut:
-    """A cut, with outcome counts of its futures.
+    """The frame at which a void ends, with the outcome counts of the control's futures from there.
 
     The void shows the control frames [0:frame].
 
@@ -53,7 +53,7 @@ class Cut:
     perturbation: float
 
     def evidence(self) -> dict[str, Any]:
-        """Return the numbers behind the certificate `open`."""
+        """Return by name the numbers behind the certificate `open`."""
         return {name: value for name, value in vars(self).items() if name != "frame"}
 
 
@@ -89,7 +89,7 @@ class _Prepared:
 
 
 class Futures:
-    """Rollouts of perturbed starts of a control, each simulated once, on request.
+    """The futures of a control: simulations of perturbed starts, each simulated once, on request.
 
     first: the cut, or the earliest that may be; a rollout that has parted before it counts nowhere and is given up.
     alike_px: a rollout parts from the control when a point of it is further off than this. held_s: so long a label must
@@ -111,7 +111,7 @@ class Futures:
             yield self._rollouts[:n_tried]
 
     def start(self, number: int) -> np.ndarray:
-        """Return a start, (nq,) float64, drawn around the first row. Raises Rejected."""
+        """Return a start, (nq,) float64, drawn around the first row of the trajectory. Raises Rejected."""
         if not 0 <= number < TRIED:
             raise Rejected(f"there is no start {number}; there are {TRIED}")
         return self._prepare.starts[number]
@@ -218,7 +218,7 @@ class Futures:
 
 
 def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
-    """Return the cut at a frame, with outcome counts of its futures."""
+    """Return the cut at a frame, with the outcome counts of its futures."""
     lookalikes = [r for r in rollouts if r.parted >= frame]
     counts = Counter(r.label for r in lookalikes if r.label is not None)
     accepted = counts.total()
@@ -227,7 +227,7 @@ def at_cut(rollouts: Sequence[Rollout], frame: int, perturbation: float) -> Cut:
 
 
 def twin_of(rollouts: Sequence[Rollout], frame: int, truth: str | None) -> Rollout:
-    """Return the first accepted rollout at a cut that ends in another answer."""
+    """Return the first accepted future at a cut that ends in another answer."""
     return next(r for r in rollouts if r.parted >= frame and r.label not in (None, truth))
 
 
@@ -273,7 +273,7 @@ def unseen_steps(model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> 
 
 
 def along_contacts(model: mujoco.MjModel, data: mujoco.MjData, step: np.ndarray) -> np.ndarray:
-    """Return a step (nv,) without parts that push free bodies into or off contacts."""
+    """Return a step (nv,) without its parts that push free bodies into or off contacts."""
     normals: dict[int, list[np.ndarray]] = {}
     for contact in data.contact[: data.ncon]:
         for geom in contact.geom:

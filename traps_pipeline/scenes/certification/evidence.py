@@ -25,7 +25,7 @@ Failures = Iterator[str]  # the failures, in words
 
 @dataclass(frozen=True)
 class Claim:
-    """A record's claims, against which its evidence is judged besides thresholds.
+    """A record's statements about its pair, against which its evidence is judged besides thresholds.
 
     end_s: time of the control's last frame. labels: how many answers the question offers. seed: what is drawn of the
     pair follows from it.
@@ -42,7 +42,7 @@ class Claim:
 
     @staticmethod
     def of_record(spec: SceneSpec) -> Claim:
-        """Return what a record claims, to be proved by its certificates."""
+        """Return the claim of a record, to be proved by its certificates."""
         physics = Physics(**spec.physics)
         return Claim(
             family=get_family(spec.family),
@@ -73,14 +73,14 @@ class Pair:
 
     @property
     def void_from(self) -> int:
-        """The frame `void_frame`. Raises Rejected while there is no void."""
+        """The index of the frame `void_frame`. Raises Rejected while there is no void."""
         if self.void_frame is None:
             raise Rejected("the pair has no void")
         return self.void_frame
 
     @property
     def other_world(self) -> World:
-        """The twin. Raises Rejected while there is none."""
+        """The world of the twin. Raises Rejected while there is none."""
         if self.twin is None:
             raise Rejected("the pair has no twin")
         return self.twin
@@ -145,14 +145,14 @@ class Certificate:
         return evidence
 
     def failure(self, evidence: Evidence, claim: Claim) -> str | None:
-        """Return why some evidence does not earn the certificate, None if it does."""
+        """Return in words why evidence does not earn the certificate, None if it does."""
         try:
             return next(self.judge(evidence, claim), None)
         except KeyError as missing:
             return f"no evidence {missing}"
 
     def contradiction(self, evidence: Evidence, stored: Evidence, *, exact: bool) -> str | None:
-        """Return how new evidence contradicts the stored evidence; None if it does not.
+        """Return in words how new evidence contradicts the stored evidence; None if it does not.
 
         exact: this machine's arithmetic is that of the one which stored it, so that not even the last digit may differ.
         """

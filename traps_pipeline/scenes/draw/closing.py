@@ -1,4 +1,4 @@
-"""Close controls: an occluder enters once the outcome has settled, and stays.
+"""Close controls: once the outcome has settled, an occluder enters before it and stays.
 
 In an occlusion scene the occluder is the void's. In a chaotic scene it stands before the place of all outcomes and
 before whatever moves in either world. Every control closes that can (docs/design/twins.md).
@@ -19,7 +19,7 @@ from traps_pipeline.scenes.worlds.world import World
 
 
 def close_control(pair: Pair, seed: int, evidence: Mapping[str, Any]) -> tuple[Pair, dict[str, Any]]:
-    """Close the control at a moment drawn by seed, if one can be. Raises Rejected."""
+    """Return the pair whose control an occluder closes at a moment drawn by seed, and evidence. Raises Rejected."""
     worlds = pair.control, pair.other_world
     for frame in moments(worlds[:1] if pair.control.occluder is None else worlds, seed):
         try:
@@ -39,7 +39,7 @@ def _certify(pair: Pair, closing: Closing | None, evidence: Mapping[str, Any]) -
 
 
 def record_of(pair: Pair) -> dict[str, Any] | None:
-    """Return a control's closing in the form that a record stores."""
+    """Return the closing of a control (from when an occluder stands) as its record stores it; None without."""
     closing = pair.control.closing
     if closing is None:
         return None
@@ -48,7 +48,7 @@ def record_of(pair: Pair) -> dict[str, Any] | None:
 
 
 def occluder_from(frame: int, control: World, *others: World) -> Occluder:
-    """Return the void's occluder, or one before all outcomes and all that moves later."""
+    """Return the void's occluder, or one that hides all outcomes and all that moves from a frame on."""
     if control.occluder is not None:
         return control.occluder
     boxes = control.scene.framed if control.scene.rest is None else (control.scene.rest,)

@@ -1,4 +1,4 @@
-"""Draw scenarios of two events: two draws of a family that differ in nothing but shape, place and outcome."""
+"""Draw scenarios of two events: two draws of a family that differ only in shape, place and outcome."""
 
 import json
 from collections import Counter
@@ -20,20 +20,20 @@ from traps_pipeline.scenes.draw.resolve import json_values
 from traps_pipeline.scenes.family_registry import families, get_family
 from traps_pipeline.scenes.parts.difficulty import DEFAULT_DIFFICULTY, Difficulty, SceneDifficulty, draw_distractors
 from traps_pipeline.scenes.parts.look import Look, draw_look
-from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Family, Wording, params_to_dict, uniform
+from traps_pipeline.scenes.physics.kit import COLOURS, LOOK_ALIKE, Family, Physics, Wording, params_to_dict, uniform
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent
 from traps_pipeline.scenes.worlds.lane_layout import Lane, fit_lanes
 from traps_pipeline.scenes.worlds.lane_records import LaneRecord, LaneTwin, TwoEventsSpec
 from traps_pipeline.scenes.worlds.lanes import TwoLanes
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import physics_record, save_trajectory, trajectory_digest
-from traps_pipeline.scenes.worlds.timetable import MOVES_FRAMES, Timetable
+from traps_pipeline.scenes.worlds.timetable import MOVES_FRAMES, WINDOW_S, Timetable
 
 STRIPS = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")
 LOOKS = ("pale-floor", "light")  # parts of the look that vary
 SETTLES_S = (0.5, 3.6)  # when the worlds of a lane settle
 ELEVATION_DEG = (-40.0, -22.0)  # of the camera: a bench below the scene needs it to look down
-SIZES = (0.6, 1.2)  # of doubles
+SIZES = (0.6, 1.6)  # of doubles
 ALIKE = (0.8, 1.25)  # the same, as a share of the size at which they have as many pixels as the things
 BOARDS = (1.0, 1.2)  # widths of boards, as a share of the least
 SETS_OUT_S = (0.0, 2.5)
@@ -58,7 +58,7 @@ def lane_families() -> list[str]:
 
 @dataclass(frozen=True)
 class DrawnLanes:
-    """A record and the trajectories, by name: of its world, and of those with the left and the right lane's twin."""
+    """A record of two events, and the trajectories by name: of its world, and of those where one lane differs."""
 
     spec: TwoEventsSpec
     worlds: Mapping[str, np.ndarray]
@@ -80,6 +80,12 @@ def draw_two_events(
 
 def _scenario(family: Family, number: int, rng: np.random.Generator, seed: int, difficulty: Difficulty) -> DrawnLanes:
     (world, *twins), wording = draw_worlds(family, number, rng, seed, difficulty)
+    if difficulty.window_s < WINDOW_S:  # the same scene, so that levels may be compared
+        window_rng = np.random.default_rng([seed, *family.name.encode(), number, *b"window"])
+        settled = [max(each.outcome(k).commit_frame for each in (world, twin)) for k, twin in enumerate(twins)]
+        how = world.physics, difficulty.window_s, window_rng
+        lanes = [narrowed(lane, at, *how) for lane, at in zip(world.lanes, settled, strict=True)]
+        world, *twins = (replace(each, lanes=lanes) for each in (world, *twins))
     evidence = certify_lanes(world, twins)
     records = [
         LaneRecord(
@@ -123,7 +129,7 @@ def draw_worlds(
     *,
     is_alike: bool = True,
 ) -> tuple[tuple[TwoLanes, TwoLanes, TwoLanes], Wording]:
-    """Return a world, those with the left and the right lane's twin, and the words for both. Raises Rejected.
+    """Return a world of two lanes, those where one lane has its twin, and the words for both. Raises Rejected.
 
     Nothing is certified. is_alike: doubles have about as many pixels as the things, which are drawn for it.
     """
@@ -208,7 +214,7 @@ def _with_distractors(pair: Pair, wording: Wording, difficulty: Difficulty, rng:
 
 
 def is_turn_of_earlier(family: str, number: int, lane: int, seed: int) -> bool:
-    """Return whether a lane shows the earlier of its two answers, as half of the lanes in every eight scenarios do."""
+    """Return whether a lane must end in the earlier of its two answers, as half of every eight scenarios do."""
     block, place = divmod(number - 1, TURNS)
     turns = np.random.default_rng([seed, *family.encode(), block, TURNS]).permutation(len(LANES) * TURNS) % 2
     return bool(turns[len(LANES) * place + lane])
@@ -253,8 +259,15 @@ def _lane(pair: tuple[LaneEvent, LaneEvent], strip: str, bench_above: bool, rng:
     return Lane(strip, bench_above, at, mirrored, rests, out, 1.0, boards, timetable)
 
 
+def narrowed(lane: Lane, settled: int, physics: Physics, window_s: float, rng: np.random.Generator) -> Lane:
+    """Return a lane whose board is away for a window alone, at any time after the outcome has settled."""
+    frames = round(window_s * physics.fps)
+    first = int(rng.integers(settled, physics.n_frames - frames + 1))
+    return replace(lane, timetable=Timetable.of_window(first, frames, physics.n_frames), window_s=window_s)
+
+
 def draw_timetable(rng: np.random.Generator, settled: int, n_frames: int, fps: int) -> Timetable | None:
-    """Draw a timetable that shows what has settled by a frame; None if none was found.
+    """Return a random timetable of a board that shows what has settled by a frame; None if none was found.
 
     In a half of them each the board stands in the first frame, and in the last; and it comes or goes at least once.
     """
@@ -315,7 +328,8 @@ def difficulty_of(record: Mapping[str, Any]) -> Difficulty:
     """Return the settings with which a record was drawn."""
     drawn = record["lanes"][0]["params"].get("difficulty") or {}
     speed = record["physics"].get("speed", DEFAULT_DIFFICULTY.speed)
-    return Difficulty(len(drawn.get("distractors", ())), speed, drawn.get("longer", False))
+    window_s = record["lanes"][0]["lane"].get("window_s", DEFAULT_DIFFICULTY.window_s)
+    return Difficulty(len(drawn.get("distractors", ())), speed, drawn.get("longer", False), window_s)
 
 
 def _id(family: str, number: int) -> str:

@@ -29,7 +29,7 @@ def frame_hash(spec: SceneSpec, qpos: np.ndarray) -> int:
 
 
 def lookalikes(hashes: Mapping[str, int]) -> dict[str, str]:
-    """Return each record that looks like another, and that other. hashes: id -> hash."""
+    """Return by id each record that looks like another, and that other. hashes: id -> hash."""
     neighbour_of = dict[str, str]()
     for first, second in combinations(hashes, 2):
         if (hashes[first] ^ hashes[second]).bit_count() <= NEAR_BITS:
@@ -39,6 +39,6 @@ def lookalikes(hashes: Mapping[str, int]) -> dict[str, str]:
 
 
 def excess_lookalike(hashes: Mapping[str, int], new: int, count: int) -> str | None:
-    """Return the record that a new clip resembles, if that is one lookalike too many among `count`."""
+    """Return the id of the record that a new clip resembles, if that is a lookalike too many among `count`."""
     pairs = lookalikes({**hashes, "new": new})
     return pairs.get("new") if len(pairs) > NEAR_SHARE * count else None

@@ -37,7 +37,7 @@ HOPELESS_SHARE = 0.9  # of the scouts; a scene whose true top share is 65 % look
 
 @dataclass(frozen=True)
 class Resolved:
-    """A record and its two trajectories, qpos at frame times (F, nq) float32."""
+    """A record, the trajectory of its control and that of its twin: qpos at frame times (F, nq) float32."""
 
     spec: SceneSpec
     qpos: np.ndarray
@@ -59,7 +59,7 @@ def resolve(
     seed: int,
     physics: Physics | None = None,
 ) -> Resolved:
-    """Return a scenario's record and trajectories. Raises Rejected for no valid pair."""
+    """Return the record and trajectories of drawn parameters. Raises Rejected if they make no valid pair."""
     physics = physics or family.physics
     full = _control(family, params, physics)
     answer = full.outcome.label

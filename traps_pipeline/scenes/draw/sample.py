@@ -48,7 +48,7 @@ _NO_QUESTION = "?"  # stands for the ill-posed question until the scenario has i
 
 @dataclass
 class Tally:
-    """The counts of a family's draws. file: digest of its file, empty in old notes."""
+    """The numbers of a family's draws. file: digest of its file, empty in old notes."""
 
     seed: int
     wanted: int
@@ -102,7 +102,7 @@ def ill_posed_quota(taxonomy: str, count: int) -> int:
 
 @dataclass(frozen=True)
 class Draw:
-    """One numbered draw of a family. closed: answers with a full quota, not resolved."""
+    """One numbered draw of a family. closed: answers that have their quota, which are not resolved."""
 
     family: str
     seed: int
@@ -196,12 +196,12 @@ def sample_family(
 
 
 def rejection_kind(reason: str) -> str:
-    """Return a rejection's reason without numbers or details, to count like ones."""
+    """Return a rejection's reason without numbers or details, so that like ones are counted together."""
     return _MEASURED.sub("", reason.split(":")[0])
 
 
 class Records:
-    """Released files of a family, except its entry in `draws.json`."""
+    """The released files of a family, except its entry in `draws.json`."""
 
     def __init__(self, released: Path, family: str) -> None:
         self._released, self._family = released, family
@@ -279,7 +279,7 @@ def _mean_choices(family: Family, longer: bool = False) -> Mapping[str, float]:
 
 
 def try_draw(draw: Draw) -> Resolved | str:
-    """Return a draw, resolved, or the reason why it is rejected."""
+    """Return the resolved scenario of a draw, or in words why it is rejected."""
     try:
         drawn_scene = scene_of_draw(draw)
         return resolve(
@@ -297,7 +297,7 @@ def try_draw(draw: Draw) -> Resolved | str:
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """The result of a draw before any pixel is examined."""
+    """The scene of a draw before any pixel is examined."""
 
     params: Any
     wording: Wording
@@ -305,7 +305,7 @@ class DrawnScene:
 
 
 def scene_of_draw(draw: Draw) -> DrawnScene:
-    """Return the scene of a numbered draw.
+    """Return the scene that a numbered draw makes.
 
     Raises Rejected if the quota of its answer is full, or the answer cannot be certified.
     """
@@ -338,7 +338,7 @@ def _with_id(family: Family, resolved: Resolved, draw: Draw, place: int, texts: 
 
 
 def ill_posed_for(spec: SceneSpec, seed: int, texts: Counter[str], count: int) -> str:
-    """Draw the ill-posed question of a record that has its id.
+    """Return an ill-posed question for a record, drawn by its id.
 
     seed: its family's. texts: questions of its family's `count` records. Raises ValueError when all are taken.
     """
@@ -355,7 +355,7 @@ def simulated_answer(family: Family, params: Any) -> str:
 
 
 def simulated_scene(family: Family, params: Any, physics: Physics) -> tuple[str, Scene, np.ndarray]:
-    """Simulate a draw's control; return its answer, its scene and points to frame.
+    """Return the answer, the scene and the points to frame of a draw's simulated control.
 
     It takes a second, so it comes before the certificates. The points, (N, 3), surround everything that is shown or
     covered. Raises Rejected if the outcome is undecided or settles too late.

@@ -20,7 +20,7 @@ MARGINS_PX = (3, 9)  # around what must be hidden, to be tried one after the oth
 
 
 def trim_candidates(pair: Pair) -> Iterator[Pair]:
-    """Yield a pair with ever larger occluders, each of which may fail a certificate."""
+    """Yield the pair with ever larger occluders, each of which may fail a certificate."""
     occluder = pair.control.occluder
     assert occluder is not None, "only an occluder can be trimmed"
     needed_mask = must_hide(pair)
@@ -31,7 +31,7 @@ def trim_candidates(pair: Pair) -> Iterator[Pair]:
 
 
 def must_hide(pair: Pair) -> np.ndarray:
-    """Return the pixels (H, W) that an occluder must cover to hide what differs."""
+    """Return a mask of the pixels (H, W) that an occluder must cover to hide what differs."""
     needed_mask, videos = np.zeros((HEIGHT, pair.control.camera.width), bool), list[list[np.ndarray]]()
     for world in (pair.control, pair.other_world):
         settled_from = max(world.outcome.commit_frame - 1, 0)
@@ -47,7 +47,7 @@ def must_hide(pair: Pair) -> np.ndarray:
 
 
 def cut_to(occluder: Occluder, camera: Camera, needed: np.ndarray, margin_px: int) -> Occluder:
-    """Return the smallest part of an occluder that covers the pixels (H, W)."""
+    """Return the smallest part of an occluder that covers the pixels of a mask (H, W)."""
     rows, columns = np.nonzero(needed)
     if not len(rows):
         return occluder

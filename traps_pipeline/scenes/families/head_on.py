@@ -130,7 +130,7 @@ def _ask_aside(p: Params, rng: np.random.Generator) -> AnswerableQuestion:
 
 def observe(frames: np.ndarray, slots: Mapping[str, str], ahead: float | None = None) -> str | None:
     """Return the ball that ends on its own side of the black line, if both rest there."""
-    line, home_balls = largest(frames[0], "black"), []
+    line, home_balls = largest(frames[-1], "black"), []
     for colour in colours_of_balls(frames, slots, BALL_COLOURS):
         path = track(frames, colour, 60)
         start, end = path[0], end_of(path, ahead)

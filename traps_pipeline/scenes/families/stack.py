@@ -168,12 +168,13 @@ def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
 
 
 def _count(frame: np.ndarray, stand_colour: str) -> int | None:
-    stand_blob = largest(frame, stand_colour, 600)  # a flag of the stand is smaller
+    stand_blob = largest(frame, stand_colour, 450)  # a flag of the stand is smaller
     if stand_blob is None:
         return None
     x, y, width, _ = stand_blob.box
     blobs_by_colour = [blobs(colour_mask(frame, colour), 60) for colour in COLOURS]
-    return sum(any(x - 4 < b.x < x + width + 4 and b.y < y + 0.4 * width for b in parts) for parts in blobs_by_colour)
+    top, foot = y - 3.5 * width, y + 0.4 * width  # a flag is above all blocks
+    return sum(any(x - 4 < b.x < x + width + 4 and top < b.y < foot for b in parts) for parts in blobs_by_colour)
 
 
 FAMILY = scene_family(

@@ -29,7 +29,7 @@ GLASS_GAP_M = 0.006  # play of a ball under the glass that keeps it on the board
 
 
 def peg_rows(least: int, most: int) -> Group:
-    """Return the fields `rows`, `peg_gap_m`, `row_shifts_m` of staggered rows of pegs."""
+    """Return a group of the fields `rows`, `peg_gap_m`, `row_shifts_m` of staggered rows of pegs."""
 
     def draw(rng: np.random.Generator, so_far: Drawn) -> tuple[int, float, tuple[float, ...]]:
         """Draw the number of rows, the gap, and shifts: half a gap in every other row."""
@@ -42,7 +42,7 @@ def peg_rows(least: int, most: int) -> Group:
 
 
 def camera_elevation(low: float, high: float) -> Any:
-    """Return the elevation of a camera off the normal of a board with a `tilt_deg`."""
+    """Return a field: the camera's elevation, off the normal of a board with a `tilt_deg`."""
     about = f"tilt_deg - 90 + ({low} to {high})"
     return drawn_by(lambda rng, so_far: uniform(rng, low, high) + so_far["tilt_deg"] - 90, about=about)
 
@@ -97,7 +97,7 @@ class Board:
         )
 
     def block(self, name: str, across: Span, up: Span, out: Span, colour: str, *, solid: bool = True) -> mujoco.MjsGeom:
-        """Return a box of the board from its three spans; without solid, paint only."""
+        """Add a box of the board from its three spans and return it; without solid, paint only."""
         spans = (across, up, out)
         centre, half_size = [sum(s) / 2 for s in spans], [(s[1] - s[0]) / 2 for s in spans]
         geom = add_box(self.body, name, centre, half_size, colour)
@@ -108,7 +108,7 @@ class Board:
         return geom
 
     def paint(self, name: str, centre: Vec3, half: Vec3, colour: str) -> mujoco.MjsGeom:
-        """Return a box from its centre and half sizes that collides with nothing."""
+        """Add a box from its centre and half sizes, which collides with nothing, and return it."""
         return add_box(self.body, name, centre, half, colour, contype=0, conaffinity=0)
 
     def frame(self, bottom: float, top: float, colour: str, *, sill: bool = True) -> None:
@@ -171,7 +171,7 @@ class Board:
     def ball(
         self, name: str, at: tuple[float, float], colour: str, friction: tuple[float, float, float] = (0.5, 0.005, 2e-4)
     ) -> mujoco.MjsGeom:
-        """Return a free ball that lies on the board at (across, up)."""
+        """Add a free ball that lies on the board at (across, up), and return it."""
         centre = self.up * at[1] + self.normal * self.ball_radius_m + np.array([at[0], 0, LIFT_M])
         geom = add_ball(self.spec, name, centre.tolist(), self.ball_radius_m, colour)
         geom.friction = list(friction)
@@ -196,7 +196,7 @@ class Board:
 
 
 def place(motion: Motion, body: str, tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a body is across the board's middle and up it (m), each (F,)."""
+    """Return the place of a body across the board's middle and up it (m), each (F,)."""
     position = motion.pos(body) - np.array([0, 0, LIFT_M])
     return position[:, 0], position @ slope(tilt_deg)[0]
 

@@ -1,4 +1,4 @@
-"""Build a world with one path through it, and the things along that path.
+"""Build a world with one path (course) through it, and the things along that path.
 
 Places are (along, across, up) in metres: along the way, away from the camera, above the floor. `direction` is +1 for a
 way to the right, -1 for one to the left: a course mirrors all that is placed on it, so that a family is written once.
@@ -88,7 +88,7 @@ def brake(radius_m: float, loss: float, length_m: float, physics: Physics) -> fl
 
 
 class Course:
-    """A world under construction. surface: default of blocks; None is MuJoCo's own."""
+    """A world under construction along one path. surface: default of blocks; None is MuJoCo's own."""
 
     def __init__(self, physics: Physics, direction: int = 1, surface: Surface | None = None) -> None:
         self.spec = new_spec(physics)
@@ -116,7 +116,7 @@ class Course:
         *,
         solid: bool = True,
     ) -> mujoco.MjsGeom:
-        """Return a static box from its three spans; without solid, paint only."""
+        """Add a static box from its three spans and return it; without solid, paint only."""
         middle = (self.direction * sum(along) / 2, sum(across) / 2, sum(up) / 2)
         half_size = ((along[1] - along[0]) / 2, (across[1] - across[0]) / 2, (up[1] - up[0]) / 2)
         geom = add_box(self.spec.worldbody, name, middle, half_size, colour)
@@ -142,7 +142,7 @@ class Course:
             self.block(f"{name}_{part}", along, across, up, colour, surface)
 
     def plank(self, name: str, a: Point, b: Point, half_width: float, colour: str) -> mujoco.MjsGeom:
-        """Return a plank, 16 mm thick, whose upper face runs from point to point."""
+        """Add a plank, 16 mm thick, whose upper face runs from point to point, and return it."""
         (xa, za), (xb, zb) = sorted(((self.direction * u, z) for u, z in (a, b)))
         angle, half_thick = -float(np.arctan2(zb - za, xb - xa)), 0.008
         centre = ((xa + xb) / 2 - half_thick * np.sin(angle), 0.0, (za + zb) / 2 - half_thick * np.cos(angle))
@@ -150,7 +150,7 @@ class Course:
         return add_box(self.spec.worldbody, name, centre, half_size, colour, euler_y=angle)
 
     def slab(self, name: str, centre: Vec3, half: Vec3, colour: str, *, falls_rad: float = 0.0) -> mujoco.MjsGeom:
-        """Return a static box from its centre and half sizes; falls_rad tilts it downhill."""
+        """Add a static box from its centre and half sizes and return it; falls_rad tilts it downhill."""
         at = (self.direction * centre[0], centre[1], centre[2])
         return add_box(self.spec.worldbody, name, at, half, colour, euler_y=self.direction * falls_rad)
 
@@ -199,7 +199,7 @@ class Course:
         solid: bool = True,
         body: mujoco.MjsBody | None = None,
     ) -> mujoco.MjsGeom:
-        """Return a round rod between two places, which are those of `body` if given."""
+        """Add a round rod between two places (of `body` if given) and return it."""
         import mujoco
 
         ends = [value for at in (a, b) for value in (self.direction * at[0], at[1], at[2])]
@@ -212,7 +212,7 @@ class Course:
     def post(
         self, name: str, at: Vec3, radius: float, half: float, colour: str, *, body: mujoco.MjsBody | None = None
     ) -> mujoco.MjsGeom:
-        """Return an upright cylinder of half a height around a place; `body` as in `rod`."""
+        """Add an upright cylinder of a half height around a place and return it; `body` as in `rod`."""
         import mujoco
 
         geom = (body or self.spec.worldbody).add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER)
@@ -222,7 +222,7 @@ class Course:
     def hull(
         self, name: str, corners: Sequence[Vec3], colour: str, *, body: mujoco.MjsBody | None = None
     ) -> mujoco.MjsGeom:
-        """Return a convex body around corners, without contact; `body` as in `rod`."""
+        """Add a convex body around corners, without contact, and return it; `body` as in `rod`."""
         import mujoco
 
         places = [value for at in corners for value in (self.direction * at[0], at[1], at[2])]
@@ -247,7 +247,7 @@ class Course:
         sliding: float = 0.8,
         density: float = 1000.0,
     ) -> mujoco.MjsGeom:
-        """Return a free ball, its centre at a place.
+        """Add a free ball with its centre at a place, and return it.
 
         speed: along the way (m/s), rolling without slipping. thrown: speeds along and up (m/s), without spin, instead.
         rolling, sliding: friction as in `Surface`. density: kg/m3.
@@ -276,7 +276,7 @@ class Course:
         sliding: float | None = None,
         solref: tuple[float, float] | None = None,
     ) -> mujoco.MjsBody:
-        """Return a free box, body and geom `name`, its centre at a place. density: kg/m3.
+        """Add a free box, body and geom `name`, with its centre at a place, and return it. density: kg/m3.
 
         sliding, solref: as in `Surface`; None leaves MuJoCo's own.
         """
@@ -310,7 +310,7 @@ class Course:
     def hinge(
         self, name: str, at: Vec3, *, axis: Vec3 = (0, 1, 0), damping: float = 0.0, range_deg: Span | None = None
     ) -> mujoco.MjsBody:
-        """Return a body that turns about an axis; add its parts with `add_box` and `rod`.
+        """Add a body that turns about an axis and return it; add its parts with `add_box` and `rod`.
 
         damping: N m s/rad. range_deg: how far it turns, as MuJoCo counts it; None turns freely. A spring is set on
         `body.first_joint()`.
@@ -403,11 +403,11 @@ class Course:
         return Box((low - left, across[0], up[0]), (high + right, across[1], up[1]))
 
     def ahead(self, length: float) -> float:
-        """Return the length if the way leads to the right, as shadows fall, else 0."""
+        """Return the length if the path leads to the right, as shadows fall, else 0."""
         return length if self.direction > 0 else 0.0
 
     def cover(self, along: Span, across: Span, high: float) -> Box:
-        """Return the box that hides things up to `high` m, with their shadows."""
+        """Return the box that the occluder must hide for things up to `high` m, with their shadows."""
         right = SHADOW_RIGHT * high if self.direction > 0 else 0.01
         return self.box(along, (across[0], across[1] + SHADOW_BACK * high), (0, high), left=0.01, right=right)
 
@@ -453,7 +453,7 @@ class Course:
 
 
 def part_colours(p: Any) -> dict[str, str]:
-    """Return part -> colour, from the fields `<part>_colour` of the parameters."""
+    """Return the colour of each part, from the fields `<part>_colour` of the parameters."""
     names = [member.name for member in fields(p) if member.name.endswith("_colour")]
     return {name.removesuffix("_colour"): getattr(p, name) for name in names}
 

@@ -43,15 +43,16 @@ BALL_COLOURS: dict[str, Colour] = {colour: colour for colour in get_args(Colour)
 
 @dataclass(frozen=True)
 class Difficulty:
-    """Settings of difficulty with which scenarios are drawn.
+    """The settings of difficulty with which scenarios are drawn.
 
     distractors: their number. speed: factor on the speed of all events. longer: rows, lanes and counts from the
-    longer ranges of their family.
+    longer ranges of their family. window_s: for how long two events show a settled outcome, at least; of pairs nothing.
     """
 
     distractors: int = 0
     speed: float = 1.0
     longer: bool = False
+    window_s: float = 1.0
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that differ from the defaults."""
@@ -62,7 +63,7 @@ DEFAULT_DIFFICULTY = Difficulty()
 
 
 def unsupported_settings(family: Family, difficulty: Difficulty) -> list[str]:
-    """Return the settings that a family does not support.
+    """Return the names of the settings that a family does not support.
 
     Distractors move, and the board that closes a chaotic control must hide all that moves.
     """
@@ -70,6 +71,7 @@ def unsupported_settings(family: Family, difficulty: Difficulty) -> list[str]:
         "distractors": family.taxonomy == "occlusion" and family.category not in EXTENSION_CATEGORIES,
         "speed": difficulty.speed <= MAX_SPEEDS.get(family.name, 1.0),
         "longer": vary.can_be_longer(family.params),
+        "window_s": False,
     }
     return [name for name in difficulty.settings() if not is_supported[name]]
 
@@ -80,7 +82,7 @@ Metres = Annotated[float, Field(ge=-10, le=10)]
 
 @dataclass(frozen=True)
 class Distractor:
-    """A thing that crosses the floor before a scene and touches nothing.
+    """A body that crosses the floor before a scene and touches nothing.
 
     It starts at `place_m` (right, away) and moves to the right at `speed_m_s` of simulated time.
     """
@@ -114,7 +116,7 @@ class SceneDifficulty:
 def draw_distractors(
     rng: np.random.Generator, count: int, scene: Scene, points: np.ndarray, wording: Wording, p: Any, duration_s: float
 ) -> tuple[Distractor, ...]:
-    """Draw distractors for a simulated scene: pucks and balls in turn.
+    """Return random distractors for a simulated scene: pucks and balls in turn.
 
     A puck has a named colour; a ball has a colour easily taken for a named one that no words of the scenario offer, and
     rolls the scene's way from its beginning, so that whatever is asked of "the ball" has one answer. They hide nothing:

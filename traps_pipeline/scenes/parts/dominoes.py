@@ -22,7 +22,7 @@ STILL_M = 0.002  # a domino that moves less than this any more is at rest
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a domino: height in metres, the rest, and the row's spacing, in heights."""
+    """The size of a domino: height in metres, the rest, and the row's spacing, in heights."""
 
     height_m: float
     width: float
@@ -98,6 +98,6 @@ def cover(course: Course, size: Size, along: Span, back: float) -> Box:
 
 
 def in_view(course: Course, size: Size, along: Span, back: float) -> Box:
-    """Return the box of the covered part that the camera must have in frame."""
+    """Return the box of the part behind the occluder that the camera must have in frame."""
     h = size.height_m
     return course.box(along, (-h * (size.width / 2 + 0.10), h * back), (0, (PLANK + 1.0) * h))

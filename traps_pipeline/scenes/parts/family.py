@@ -11,7 +11,7 @@ from traps_pipeline.scenes.parts.difficulty import SceneDifficulty, add_distract
 from traps_pipeline.scenes.parts.look import OCCLUSION_PARTS, Look, apply_look, look_of
 from traps_pipeline.scenes.parts.observers import Observer
 from traps_pipeline.scenes.parts.questions import Aside, Question
-from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, is_still, without_flags
+from traps_pipeline.scenes.parts.vision import after_occluder, before_occluder, is_still, until_covered, without_flags
 from traps_pipeline.scenes.physics.kit import Family, Motion, Physics, Reading, Scene
 from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH
 
@@ -52,22 +52,21 @@ def scene_family(
 
     def observe_question(frames: np.ndarray, text: str) -> str | None:
         slots = question.slots_in(text)
-        if slots is None:
+        if slots is None or len(frames) < 3:  # fewer do not show rest
             return None
         if frames.shape[1:3] != (HEIGHT, WIDTH):  # what an observer takes for large is so at this size
             frames = np.stack([cv2.resize(frame, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for frame in frames])
-        visible = before_occluder(frames)  # what an occluder covers at the end was seen before it came
-        frames_without_flags = visible if twins is None else without_flags(visible)
-        if foresee is not None and len(visible) < len(frames):
-            # The shadow of an occluder may come before it does.
-            is_at_rest = is_still(visible) or is_still(visible[:-1])
-            return _first_answer(frames_without_flags, slots, (observe, foresee) if is_at_rest else (foresee, observe))
-        answer = observe(frames_without_flags, slots)
-        if (
-            answer is None
-            and look is not None
-            and len(end := after_occluder(frames_without_flags)) < len(frames_without_flags)
-        ):
+        n_before = len(before_occluder(frames))  # what an occluder covers at the end was seen before it came
+        comes = n_before < len(frames)
+        visible = until_covered(frames, n_before) if comes and foresee is not None else frames[:n_before]
+        seen = visible if twins is None else without_flags(visible)
+        if comes and foresee is not None:
+            before, longest_first = seen[:n_before], [seen[:n] for n in range(len(seen), n_before, -1)]
+            if any(n > 1 and is_still(frames[:n]) for n in (n_before, n_before - 1)):  # its shadow may come first
+                return _first_answer([before], slots, (observe, foresee))
+            return _first_answer(longest_first, slots, (foresee,)) or _first_answer([before], slots, (foresee, observe))
+        answer = observe(seen, slots)
+        if answer is None and look is not None and 3 <= len(end := after_occluder(seen)) < len(seen):
             return look(end, slots)
         return answer
 
@@ -95,5 +94,6 @@ def scene_family(
     )
 
 
-def _first_answer(frames: np.ndarray, slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
-    return next((answer for observe in observers if (answer := observe(frames, slots)) is not None), None)
+def _first_answer(clips: Sequence[np.ndarray], slots: Mapping[str, str], observers: Sequence[Observer]) -> str | None:
+    answers = (observe(frames, slots) for frames in clips if len(frames) > 2 for observe in observers)
+    return next((answer for answer in answers if answer is not None), None)

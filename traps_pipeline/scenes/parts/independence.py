@@ -19,7 +19,7 @@ MIN_EXPECTED = 5  # draws of each world in a row of a table; rarer values share 
 
 
 def dependence(family: Family) -> str | None:
-    """Return how the hidden element depends on visible things; None if it does not."""
+    """Return in words how the hidden element depends on visible things; None if it does not."""
     if family.twins is None:
         return None
     scenes = [_worlds(family, family.draw(np.random.default_rng(seed))) for seed in range(DRAWS)]

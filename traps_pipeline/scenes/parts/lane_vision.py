@@ -16,7 +16,7 @@ PLATE_ROWS, PLATE_BELOW_PX = 2, 10  # of a bench's plate, at a board's place and
 
 
 def scenes_of_lane(frames: np.ndarray, strip: str) -> list[np.ndarray]:
-    """Return the frames (M, 360, 480, 3) of a lane's scene before which no board is; nothing if there are none.
+    """Return the frames (M, 360, 480, 3) that show a lane's scene without a board before it.
 
     frames: (N, H, W, 3). First come these after those in which a board stands before the scene from the first frame on,
     since what begins beside it is seen in them; then these alone.

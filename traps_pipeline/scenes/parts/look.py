@@ -86,7 +86,7 @@ class Look:
 
 
 def look_of_draw(seed: int, family: str, number: int, parts: Collection[str]) -> Look | None:
-    """Return the look of a numbered draw of a family, drawn by itself."""
+    """Return the look of a numbered draw of a family, drawn independently of the scene."""
     return draw_look(np.random.default_rng([seed, *family.encode(), number, *b"look"]), parts)
 
 
@@ -129,7 +129,7 @@ def look_of(params: Any) -> Look | None:
 
 
 def fineness(params: Any) -> int:
-    """Return the factor by which a scene's frames are finer than 480x360."""
+    """Return the factor by which a scene's frames are larger than 480x360."""
     look = look_of(params)
     return 1 if look is None else SIZES[look.size]
 
@@ -141,7 +141,7 @@ def frame_size(record: Mapping[str, Any]) -> tuple[int, int]:
     return WIDTH * scale, HEIGHT * scale
 
 
-def occluder_tones(colour: np.ndarray, line: np.ndarray) -> np.ndarray:
+def occluder_texture(colour: np.ndarray, line: np.ndarray) -> np.ndarray:
     """Return an occluder's texture, uint8 (..., 3): its colour (sRGB), paler where `line` (...) is true."""
     tone = np.where(line[..., None], np.minimum(1.0, LINE_TONE * colour + 0.06), colour)
     return np.rint(255 * tone).astype(np.uint8)
@@ -162,7 +162,7 @@ def paint_occluders(spec: mujoco.MjSpec, occluders: Sequence[mujoco.MjsGeom], pa
     texture = spec.add_texture(name="occluder", type=mujoco.mjtTexture.mjTEXTURE_2D)
     texture.width = texture.height = TEXELS
     texture.nchannel = 3
-    texture.data = occluder_tones(np.array(colour), line).tobytes()
+    texture.data = occluder_texture(np.array(colour), line).tobytes()
     material = spec.add_material(name="occluder", specular=0.0, shininess=0.0, reflectance=0.0, rgba=[1, 1, 1, 1])
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "occluder"
     material.texuniform, material.texrepeat = True, [LINES_PER_M] * 2

@@ -1,4 +1,4 @@
-"""Build observers, which answer a question from frames and its slots, or abstain.
+"""Build observers: functions that answer a question from frames and its slots, or abstain.
 
 An `Observer(frames, slots)` gets the sampled frames (N, 360, 480, 3) RGB and what the question names, read back from
 its templates: part -> colour, and 'choices' where it offers some. It gives a label, or None if the decisive thing is
@@ -39,14 +39,14 @@ MAX_FRAMES_LOST = 2  # for so many frames a moving thing may be out of sight
 
 
 def small_blob(frame: np.ndarray, colour: str) -> Blob | None:
-    """Return the largest region of a colour that is no longer than a ball (80 px)."""
+    """Return the largest region of a colour that is no longer than a ball (80 px); None if there is none."""
     return next((blob for blob in blobs(colour_mask(frame, colour), 60) if max(blob.box[2:]) < 80), None)
 
 
 def compact_blob(
     frame: np.ndarray, colour: str, *, area: int = 4000, shape: tuple[float, float] = (0.4, 2.5), fill: float = 0.5
 ) -> Blob | None:
-    """Return the largest region of a colour that may be a ball: filled, about round.
+    """Return the largest region of a colour that may be a ball (filled, about round); None if there is none.
 
     area: maximum in pixels. shape: range of width over height. fill: minimum share of its bounding box.
     """
@@ -57,7 +57,7 @@ def compact_blob(
 
 
 def offered(slots: Mapping[str, str], otherwise: Sequence[str]) -> Sequence[str]:
-    """Return the choices that the question offers, or `otherwise` if it offers none."""
+    """Return the answer choices that the question offers, or `otherwise` if it offers none."""
     return choices_in(slots["choices"]) if "choices" in slots else otherwise
 
 
@@ -92,14 +92,14 @@ def is_upper_half_in_place(frames: np.ndarray, colour: str, first: Blob) -> bool
 
 
 def end_of(path: Sequence[Blob | None], ahead: float | None = None, tolerance_px: float = 1.5) -> Blob | None:
-    """Return the thing at rest, or extrapolated by `ahead` frames; else None."""
+    """Return the region of a thing at rest, or extrapolated by `ahead` frames; else None."""
     if ahead is not None:
         return extrapolate(path, ahead)
     return path[-1] if is_at_rest(path, tolerance_px=tolerance_px) else None
 
 
 def extrapolate(path: Sequence[Blob | None], ahead: float) -> Blob | None:
-    """Extrapolate a thing some frames ahead at its last speed; None if long lost."""
+    """Return a thing's region some frames ahead at its last speed; None if long lost."""
     sightings = [(index, blob) for index, blob in enumerate(path) if blob is not None]
     if not sightings or len(path) - 1 - sightings[-1][0] > MAX_FRAMES_LOST:
         return None
@@ -129,7 +129,7 @@ def surrounding_slices(thing: Blob, reach: float) -> tuple[slice, slice]:
 
 
 def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
-    """Return an observer of whether the thing rests on the far side of the mark."""
+    """Return an observer that tells whether the thing rests on the far side of the mark."""
 
     def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         path, line = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
@@ -142,7 +142,7 @@ def beyond(thing: str, mark: str, ahead: float | None = None) -> Observer:
 
 
 def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observer:
-    """Return an observer of whether the thing rests past the screen's farther edge."""
+    """Return an observer that tells whether the thing rests past the screen's farther edge."""
 
     def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         path = [small_blob(frame, slots[thing]) for frame in frames]
@@ -157,7 +157,7 @@ def past_far_edge(thing: str, screen: str, ahead: float | None = None) -> Observ
 
 
 def rests_over(thing: str, goal: str, find: Finder = compact_blob, ahead: float | None = None) -> Observer:
-    """Return an observer of whether the thing rests within the goal's width + 2 px."""
+    """Return an observer that tells whether the thing rests within the goal's width + 2 px."""
 
     def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         path = [find(frame, slots[thing]) for frame in frames]
@@ -180,7 +180,7 @@ def nearer_side(
     tolerance_px: float = 1.5,
     ahead: float | None = None,
 ) -> Observer:
-    """Return an observer of which of two marks the resting thing is nearer to.
+    """Return an observer that tells which of two marks the resting thing is nearer to.
 
     left, right: slots, or colours. least: smallest area of a mark (pixels).
     """
@@ -197,7 +197,7 @@ def nearer_side(
 
 
 def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | None = None) -> Observer:
-    """Return an observer of whether the thing rests nearer the goal than the start.
+    """Return an observer that tells whether the thing rests nearer the goal than the start.
 
     foot: which share of the thing's height, from its top, stands for its place; None takes its middle.
     """
@@ -217,7 +217,7 @@ def reaches(thing: str, goal: str, foot: float | None = None, ahead: float | Non
 
 
 def has_fallen(thing: str) -> Observer:
-    """Return an observer of whether the resting thing has left its first stand."""
+    """Return an observer that tells whether the resting thing has left its first stand."""
 
     def observe(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         path = track(frames, slots[thing], 60)
@@ -229,7 +229,7 @@ def has_fallen(thing: str) -> Observer:
 
 
 def has_begun(thing: str, reach: float) -> Observer:
-    """Return an observer that reads whether a thing has begun to move, or is about to be struck."""
+    """Return an observer that tells whether a thing has begun to move, or is about to be struck."""
 
     def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         first, last = largest(frames[0], slots[thing], 60), largest(frames[-1], slots[thing], 60)
@@ -244,7 +244,7 @@ def has_begun(thing: str, reach: float) -> Observer:
 
 
 def will_clear(thing: str, mark: str) -> Observer:
-    """Return an observer of whether the thing is beyond the mark or will fly over it."""
+    """Return an observer that tells whether the thing is beyond the mark or will fly over it."""
 
     def foresee(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         path, wall = track(frames, slots[thing], 60), largest(frames[-1], slots[mark], 60)
@@ -268,7 +268,7 @@ def will_clear(thing: str, mark: str) -> Observer:
 
 
 def lies_on(thing: str, goal: str) -> Observer:
-    """Return an observer of whether the thing rests between the goal's ends."""
+    """Return an observer that tells whether the thing rests between the goal's ends."""
 
     def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         end = end_of(track(frames, slots[thing], 60))
@@ -282,7 +282,7 @@ def lies_on(thing: str, goal: str) -> Observer:
 
 
 def lies_flat(thing: str) -> Observer:
-    """Return an observer of whether the resting thing is wider than high."""
+    """Return an observer that tells whether the resting thing is wider than high."""
 
     def look(frames: np.ndarray, slots: Mapping[str, str]) -> str | None:
         end = end_of(track(frames, slots[thing], 60))

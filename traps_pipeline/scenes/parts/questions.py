@@ -21,7 +21,7 @@ Aside = Callable[[Any, np.random.Generator], AnswerableQuestion]
 
 @dataclass(frozen=True)
 class Filled:
-    """A question for one scenario. aliases: form -> label, fills: placeholder -> text."""
+    """The answers and texts of a question in one scenario. aliases: form -> label, fills: placeholder -> text."""
 
     labels: tuple[str, ...]
     aliases: Mapping[str, str]
@@ -30,20 +30,20 @@ class Filled:
 
 @dataclass(frozen=True)
 class Question:
-    """A question in some wordings. fill(p, rng): its choices and slots, drawn first."""
+    """A question in one or more wordings. fill(p, rng): its choices and slots, drawn first."""
 
     answer_type: AnswerType
     templates: tuple[str, ...]
     fill: Callable[[Any, np.random.Generator], Filled]
 
     def word(self, p: Any, rng: np.random.Generator, asides: Sequence[Aside]) -> Wording:
-        """Word the question and one of the asides; a sole aside costs no draw."""
+        """Return the words of the question and one of the asides; a sole aside costs no draw."""
         question = self.fill(p, rng)
         text = str(rng.choice(self.templates)).format_map({**part_colours(p), **question.fills})
         return Wording(text, question.labels, question.aliases, _choose(asides, rng)(p, rng))
 
     def slots_in(self, question: str) -> dict[str, str] | None:
-        """Return what fills this question's placeholders; None if it is another one."""
+        """Return the text of each placeholder in a question; None if it is another question."""
         return match_slots(self.templates, question)
 
 
@@ -100,7 +100,7 @@ NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight
 
 
 def range_of(ranges: Sequence[Sequence[int]], count: int) -> str | None:
-    """Return the choice '<lowest>-<highest>' that holds a count; None if none does."""
+    """Return the choice '<lowest>-<highest>' in which a count lies; None if there is none."""
     return next((f"{low}-{high}" for low, high in ranges if low <= count <= high), None)
 
 

@@ -43,7 +43,7 @@ class Ramp:
     def board(
         self, course: Course, name: str, up: float, over: float, half: Vec3, colour: str, *, aside: float = 0.0
     ) -> mujoco.MjsGeom:
-        """Return a box on the slope. half: half sizes up the slope, across it, out of it."""
+        """Add a box on the slope and return it. half: half sizes up the slope, across it, out of it."""
         centre = self.at(up, over, aside)
         if not self.towards_camera:
             return course.slab(name, centre, half, colour, falls_rad=self.slope_rad)

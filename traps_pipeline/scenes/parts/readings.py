@@ -1,4 +1,4 @@
-"""Read simulations: each frame's outcome label, and the end state's margin.
+"""Read simulations: the outcome's label in each frame, and the margin of the end state.
 
 A family's `outcome(motion, p)` gives a `kit.Reading`, mostly from one of the functions here. Arrays over the frames are
 (F,), lengths in metres.
@@ -32,22 +32,22 @@ def still_from(*paths: np.ndarray, within_m: float) -> int:
 
 
 def clear_m(past: np.ndarray, before_m: float = 0.0) -> float:
-    """Return how far (m) a thing ends past a line, or its front ends before it."""
+    """Return the distance (m) by which a thing ends past a line, or its front ends before it."""
     return float(past[-1] if past[-1] > 0 else -past[-1] - before_m)
 
 
 def undecided(motion: Motion) -> Labels:
-    """Return no label for any frame: a run without a valid outcome."""
+    """Return labels that are None in every frame: of a run without a valid outcome."""
     return [None] * len(motion.times)
 
 
 def label_from(first: int, label: str, motion: Motion) -> Labels:
-    """Return an outcome that is undecided before a frame and this label from it on."""
+    """Return labels (one per frame): None before a frame, and this label from it on."""
     return [label if i >= first else None for i in range(len(motion.times))]
 
 
 def yes_while(holds: np.ndarray, no_from: int, no_where: np.ndarray | bool = True) -> Labels:
-    """Return 'yes' where `holds` (F,), 'no' elsewhere from a frame on if `no_where`."""
+    """Return labels: 'yes' where `holds` (F,), 'no' elsewhere from a frame on if `no_where`."""
     no_where = np.broadcast_to(no_where, holds.shape)
     return [
         "yes" if yes else "no" if i >= no_from and no else None
@@ -56,19 +56,19 @@ def yes_while(holds: np.ndarray, no_from: int, no_where: np.ndarray | bool = Tru
 
 
 def side_while(valid: np.ndarray, past: np.ndarray, over: str = "yes", under: str = "no") -> Labels:
-    """Return `over` where `past` > 0, else `under`, in the frames that are `valid`."""
+    """Return labels: `over` where `past` > 0, else `under`, in the frames that are `valid`."""
     return [(over if x > 0 else under) if counts else None for x, counts in zip(past, valid, strict=True)]
 
 
 def read_crossing(past: np.ndarray, valid: np.ndarray | bool = True) -> Reading:
-    """Read 'yes' if `past` (F,) m ends above 0, else 'no', and its end as the margin."""
+    """Return the reading 'yes' if `past` (F,) m ends above 0, else 'no', with its end as the margin."""
     first = lasting_from(valid & (np.sign(past) == np.sign(past[-1])))
     answer = "yes" if past[-1] > 0 else "no"
     return Reading([answer if i >= first else None for i in range(len(past))], float(abs(past[-1])))
 
 
 def read_passage(rear_past: np.ndarray, radius_m: float) -> Reading:
-    """Read 'yes' once a ball's rear is out, `rear_past` (F,) > 0, 'no' if it stays in.
+    """Return the reading 'yes' once a ball's rear is out, `rear_past` (F,) > 0, 'no' if it stays in.
 
     The margin is how far the ball ends out, or how far its front is from coming out.
     """
@@ -80,7 +80,7 @@ def read_passage(rear_past: np.ndarray, radius_m: float) -> Reading:
 
 
 def first_past(motion: Motion, ahead: np.ndarray, names: Sequence[str], min_lead_s: float) -> Reading:
-    """Read which name is first past the line: `ahead` (F, N) m above 0.
+    """Return the reading of which name is first past the line: `ahead` (F, N) m above 0.
 
     There is no reading if a competitor never gets past or the lead is below `min_lead_s`. The margin is how far the
     second still is from the line when the first is past it.

@@ -35,7 +35,7 @@ _HUES: Mapping[str, tuple[float, float, float, float]] = {
 
 @dataclass(frozen=True)
 class Blob:
-    """A connected region: centroid, box (x, y, width, height) and area, in pixels."""
+    """A connected region of pixels: centroid, box (x, y, width, height) and area, in pixels."""
 
     x: float
     y: float
@@ -71,7 +71,7 @@ def colour_mask(frame: np.ndarray, colour: str) -> np.ndarray:
 
 
 def blobs(mask: np.ndarray, min_area: int = 12) -> list[Blob]:
-    """Return connected regions of a mask, largest first."""
+    """Return the connected regions of a mask, largest first."""
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     contours = [
         Blob(
@@ -106,7 +106,7 @@ def largest_board(frame: np.ndarray, min_area: int = 12) -> Blob | None:
 def slanting_edges(
     frame: np.ndarray, part: tuple[slice, slice], slants: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return two masks: a part's edges that fall to the left, and to the right.
+    """Return the masks of a part's edges that fall to the left, and to the right.
 
     slants: least and greatest slope, in rows a column.
     """
@@ -177,6 +177,37 @@ def _first_moving_frame(frames: np.ndarray, comes: int, colour: np.ndarray) -> i
     return first
 
 
+def until_covered(frames: np.ndarray, n_before: int) -> np.ndarray:
+    """Return the frames before an occluder, and then those of its way in which it is before nothing that moves.
+
+    n_before: frames before it is in view. What it hides on its way is painted as it was before.
+    """
+    seen = [*frames[:n_before]]
+    for frame in frames[n_before : n_before + COMES_FRAMES] if n_before > 1 else ():
+        is_new = _levels(frame, seen[-1]) > CHANGED_LEVELS
+        board = largest_board(np.where(is_new[..., None], frame, 255), COMING_PX)
+        if board is None:
+            break
+        x, y, width, height = board.box
+        part = np.s_[max(0, y - 2) : y + height + 2, max(0, x - 2) : x + width + 2]
+        moved = motion_mask(np.stack(seen[-2:])) & ~_is_shaded(seen[-2], seen[-1])
+        _, names = cv2.connectedComponents(moved.astype(np.uint8))
+        sizes, covered = np.bincount(names.ravel()), np.bincount(names[part].ravel(), minlength=names.max() + 1)
+        if ((sizes >= MOVED_PX) & (covered > sizes / 2))[1:].any():
+            break
+        seen.append(frame.copy())
+        seen[-1][part] = seen[-2][part]
+    return np.stack(seen)
+
+
+def _is_shaded(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the mask of pixels that turned darker and kept their hue, bool (H, W), as in a shadow."""
+    old, new = before.astype(np.float32) + 1, after.astype(np.float32) + 1
+    light = (new * old).sum(axis=2) / (old * old).sum(axis=2)
+    error = np.linalg.norm(new - light[..., None] * old, axis=2) / np.linalg.norm(old, axis=2)
+    return (light < 1) & (error < 0.06)
+
+
 def after_occluder(frames: np.ndarray) -> np.ndarray:
     """Return the frames after an occluder that stood from the first on has gone."""
     return before_occluder(frames[::-1])[::-1]
@@ -199,7 +230,7 @@ def _levels(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def without_flags(frames: np.ndarray) -> np.ndarray:
-    """Return frames (F, H, W, 3) whose flags are painted over with the colours beside them.
+    """Return frames (F, H, W, 3) whose flags (signs over hidden things) are painted over.
 
     A flag is a small upright patch of one colour at the top of a thin dark mast, to its right; both stand still. Of a
     black flag the mast is told apart only below.

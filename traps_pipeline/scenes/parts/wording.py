@@ -39,15 +39,15 @@ def match_slots(templates: Sequence[str], question: str) -> dict[str, str] | Non
 
 
 def choices_in(text: str) -> tuple[str, ...]:
-    """Return the choices in the text of `kit.list_choices`: 'red, blue or green'."""
+    """Return the answer choices in the text of `kit.list_choices`: 'red, blue or green'."""
     return tuple(re.split(r", | or ", text))
 
 
-LANE_QUESTION = "In the lane with the {strip} strip, leaving its bench aside: {question}"  # of two events
+LANE_QUESTION = "In the lane with the {strip} strip, not on its grey bench: {question}"  # of two events
 
 
 def lane_question(strip: str, question: str) -> str:
-    """Return a family's question about the lane with a strip."""
+    """Return a question about the lane that is marked by a strip of some colour."""
     return LANE_QUESTION.format(strip=strip, question=f"{question[0].lower()}{question[1:]}")
 
 
@@ -176,7 +176,7 @@ _COLOUR_WORDS = frozenset(COLOURS) - {"wood"} | frozenset(ABSENT_COLOURS)
 
 
 def false_premises(question: str, inventory: Inventory, *, near: bool = False) -> list[str]:
-    """Return a question's presumptions that the inventory refutes.
+    """Return in words the presumptions of a question that the inventory of the scene refutes.
 
     near: include colours like those in view, which a viewer may take for another false premise, though they refute
     nothing.
@@ -235,7 +235,7 @@ def _lab(srgb: Sequence[float]) -> np.ndarray:
 
 
 def refutation(taxonomy: Taxonomy, question: str, inventory: Inventory) -> str | None:
-    """Return why a control cannot answer the question; None if nothing says so."""
+    """Return in words why a control cannot answer the question; None if nothing says so."""
     return beyond_video(question) if taxonomy == "occlusion" else false_premise(question, inventory)
 
 

@@ -30,8 +30,8 @@ def carriers(model: mujoco.MjModel, flex: int) -> np.ndarray:
     return bodies[int(first) : int(first) + int(count)]
 
 
-def is_carrier(model: mujoco.MjModel) -> np.ndarray:
-    """Return whether each body only carries a soft body, (nbody,) bool."""
+def soft_body_mask(model: mujoco.MjModel) -> np.ndarray:
+    """Return whether each body does nothing but carry a soft body, (nbody,) bool."""
     mask = np.zeros(model.nbody, bool)
     for flex in range(model.nflex):
         mask[carriers(model, flex)] = True

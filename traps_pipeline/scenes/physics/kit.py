@@ -104,7 +104,7 @@ class View:
 
 @dataclass(frozen=True)
 class Inventory:
-    """The things a viewer can name; ill-posed questions use it (`wording.py`).
+    """The colours and things in a scene that a viewer can name; ill-posed questions use it.
 
     colours: every colour in view. objects: every noun, singular ('ball', 'ramp'). things: phrases that single one out
     ('red ball', 'wooden ramp'), which occlusion scenes are asked about; at least three of them.
@@ -145,13 +145,13 @@ class Scene:
 
 
 def flag_of(phrase: str) -> str:
-    """Return the name of a flag's geom."""
+    """Return the name of the geom of a flag over what a question names."""
     return f"flag {phrase}"
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses of all named bodies at the frame times.
+    """The poses of all named bodies at the frame times.
 
     times: (F,) seconds. positions: body -> (F, 3) m. rotations: body -> (F, 3, 3), columns are the body's axes.
     vertices: soft body -> (F, V, 3) m.
@@ -337,7 +337,7 @@ def add_box(
     euler_y: float = 0.0,
     **attributes: Any,
 ) -> mujoco.MjsGeom:
-    """Return a box geom on a body, or on `spec.worldbody`, tilted about y (rad)."""
+    """Add a box geom to a body, or to `spec.worldbody`, tilted about y (rad), and return it."""
     import mujoco
 
     geom = parent.add_geom(
@@ -353,7 +353,7 @@ def add_box(
 def add_ball(
     spec: mujoco.MjSpec, name: str, centre: Sequence[float], radius: float, colour: str, *, density: float = 1000.0
 ) -> mujoco.MjsGeom:
-    """Return a free ball, body and geom `name`, that friction brings to rest."""
+    """Add a free ball, body and geom `name`, that friction brings to rest, and return it."""
     import mujoco
 
     body = spec.worldbody.add_body(name=name, pos=list(centre))

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from traps_pipeline.scenes.physics.kit import Box, Vec3, View
+if TYPE_CHECKING:
+    from traps_pipeline.scenes.physics.kit import Box, View
 
+Vec3 = tuple[float, float, float]  # the kit's, which records of boards are checked by, and which brings the physics
 WIDTH, HEIGHT = 480, 360
 WIDE = 640  # width of a clip of two lanes, in the same height
 FRAME_FILL = 0.92  # share of the half-frame that the fitted points may use
@@ -78,14 +80,14 @@ class Occluder:
 
     def corners(self) -> np.ndarray:
         """Return the eight corners in the world, shape (8, 3)."""
-        local = Box(tuple(-h for h in self.half), self.half).corners()  # type: ignore[arg-type]
+        local = (2 * np.indices((2, 2, 2)).reshape(3, 8).T - 1) * self.half  # from low to high, the last axis fastest
         c, s = np.cos(np.radians(self.yaw_deg)), np.sin(np.radians(self.yaw_deg))
         return local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + np.array(self.centre)
 
 
 @dataclass(frozen=True)
 class Closing:
-    """A control's end: from this frame on an occluder stands before the outcome."""
+    """The end of a control: from this frame on an occluder stands before the outcome."""
 
     frame: int
     occluder: Occluder
@@ -158,7 +160,7 @@ def fit_occluder(camera: Camera, cover: Box, stage: np.ndarray | None = None) ->
 
 
 def fit_shot(view: View, points: np.ndarray, cover: Box | None) -> tuple[Camera, Occluder | None]:
-    """Fit a camera, and an occluder in its frame; return both."""
+    """Return a camera that has all points in frame, and an occluder in its frame."""
     camera, occluder = fit_camera(view, points), None
     if cover is None:
         return camera, None

@@ -26,7 +26,7 @@ def least_visible(renderer: Renderer, qpos: np.ndarray, groups: Sequence[tuple[t
 
 @dataclass(frozen=True)
 class PastOccluder:
-    """Pixels (F,) of decisive bodies and of the hidden element in a void's frames."""
+    """The pixels (F,) that decisive bodies and the hidden element show in a void's frames."""
 
     decisive: np.ndarray
     hidden: np.ndarray
@@ -37,18 +37,18 @@ class PastOccluder:
         return int(visible_frames[-1]) + 1 if visible_frames.size else 0
 
     def leaked(self, first: int) -> float:
-        """Return decisive pixels from a frame on, and all of the hidden element."""
+        """Return the number of decisive pixels from a frame on, and of all of the hidden element."""
         return float(self.decisive[first:].sum() + self.hidden.sum())
 
 
 def past_occluder(renderer: Renderer, qpos: np.ndarray, decisive: Sequence[str], hidden: Sequence[str]) -> PastOccluder:
-    """Return the visible pixels of some geoms past the occluder, by segmentation."""
+    """Return the numbers of pixels that some geoms show past the occluder, by segmentation."""
     counts = renderer.visible_pixels(qpos, [*decisive, *hidden], occluder=True)
     return PastOccluder(counts[:, : len(decisive)].sum(axis=1), counts[:, len(decisive) :].sum(axis=1))
 
 
 def seen_moving(pixels: np.ndarray, places: np.ndarray, *, least_px: float, step_px: float) -> int:
-    """Count the steps of at least `step_px` whose body is visible in both frames.
+    """Return the number of steps of at least `step_px` whose body is visible in both frames.
 
     pixels (F,), places (F, 2) in pixels.
     """
@@ -72,15 +72,15 @@ def swept_behind(camera: Camera, swept: Sequence[np.ndarray], occluder: Occluder
     return float((motion_mask & board).sum() / max(1, motion_mask.sum()))
 
 
-def void_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
-    """Yield the void of a trajectory, without some geoms."""
+def occluded_frames(renderer: Renderer, qpos: np.ndarray, without: Sequence[str] = ()) -> Iterator[np.ndarray]:
+    """Yield the frames of a trajectory drawn with the void's occluder, without some geoms."""
     yield from renderer.frames(qpos, occluder=True, without=without)
 
 
 def closing_frames(
     renderer: Renderer, qpos: np.ndarray, board: Coming, *, occluder: bool = False
 ) -> Iterator[np.ndarray]:
-    """Yield a trajectory (F, nq) with its closing board, and the void's if `occluder`.
+    """Yield frames of a trajectory (F, nq) with the board that closes it, and the void's if `occluder`.
 
     board: offset of the board in each row; once it stands it is drawn in place of the void's own.
     """
@@ -96,8 +96,8 @@ def ablation_pixels(
 
     void: the frames with them, if they are drawn already.
     """
-    complete_frames = void_frames(renderer, qpos) if void is None else void
-    return differing_pixels(complete_frames, void_frames(renderer, qpos, without=geoms))[0]
+    complete_frames = occluded_frames(renderer, qpos) if void is None else void
+    return differing_pixels(complete_frames, occluded_frames(renderer, qpos, without=geoms))[0]
 
 
 def differing_pixels(frames: Iterable[np.ndarray], counterparts: Iterable[np.ndarray]) -> tuple[int, int]:

@@ -40,7 +40,7 @@ def coming_board(closing: Closing | None, camera: Camera, n_frames: int, fps: fl
 
 
 def before_board(occluder: Occluder) -> np.ndarray:
-    """Return the offset of a coming board to a standing one, towards the camera (m)."""
+    """Return the offset (m) of a coming board to a standing one, towards the camera."""
     azimuth = math.radians(occluder.yaw_deg + 90.0)
     return -(2 * occluder.half[1] + IN_FRONT_M) * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
 

@@ -26,7 +26,7 @@ _renderer_open = False  # contexts of two models in one GL context would draw in
 
 
 class RenderingUnavailable(RuntimeError):
-    """No usable off-screen GL; the message says what to install."""
+    """Raised where no off-screen GL is usable; the message says what to install."""
 
 
 def _make_current(width: int, height: int) -> None:
@@ -86,7 +86,7 @@ def _make_floors_finite(model: mujoco.MjModel, camera: Camera) -> None:
 
 
 class Renderer:
-    """Context manager that draws a model from a camera: uint8 RGB, (360, width, 3).
+    """A context manager that draws a model from a camera: uint8 RGB, (360, width, 3).
 
     Frames are (720, 960, 3) of a model whose look is as fine as that. supersample: factor by which the drawing is
     larger; 1 takes a quarter of the time, where edges need not be smooth.

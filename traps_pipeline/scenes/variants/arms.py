@@ -1,4 +1,4 @@
-"""Define arms: clips and questions that take one shortcut away (docs/arms.md).
+"""Define arms: datasets beside the pairs whose clips and questions take one shortcut away (docs/arms.md).
 
 A shortcut tells control from void without looking at what happens: an occluder in the first frame, a short clip, the
 words of a question. In an arm the shortcut points the wrong way, and a certificate says that it may: what must be
@@ -36,7 +36,7 @@ LEAD_FRAMES = (5, 3, 2, 1)  # frames before commitment at which it may cut, the 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A record with its two worlds, and frames that several arms need."""
+    """A record with the worlds of its control and its twin, and frames that several arms need."""
 
     spec: SceneSpec
     control: World
@@ -54,26 +54,26 @@ class Scenario:
 
     @cached_property
     def control_frames(self) -> list[np.ndarray]:
-        """The control without the occluder that may close it."""
+        """The frames of the control without the occluder that may close it."""
         with self.control.renderer() as renderer:
             return list(renderer.frames(self.control.qpos))
 
     @cached_property
     def twin_frames(self) -> list[np.ndarray]:
-        """The other world without any occluder."""
+        """The frames of the twin without any occluder."""
         with self.twin.renderer() as renderer:
             return list(renderer.frames(self.twin.qpos))
 
     @property
     def void_frames(self) -> list[np.ndarray]:
-        """The void: with its occluder, or up to its cut."""
+        """The frames of the void: with its occluder, or up to its cut."""
         if self.control.occluder is not None:
             return self.control.void_frames
         return self.control_frames[: self.spec.void["cut_frame"]]
 
     @property
     def sampled(self) -> slice:
-        """The frames that the 5 FPS sample shows."""
+        """The indices of the frames that the 5 FPS sample shows."""
         return slice(0, None, self.fps // checks.SAMPLED_FPS)
 
 
@@ -115,8 +115,8 @@ class Arm:
     film: Callable[[Scenario], Take]
 
 
-def must_answer(spec: SceneSpec) -> list[Question]:
-    """Return the record's question for the arm's clip, to be answered."""
+def questions_to_answer(spec: SceneSpec) -> list[Question]:
+    """Return the record's question for the arm's clip, as the only one; it must be answered."""
     return [Question("control", spec.question, spec.ground_truth)]
 
 
@@ -226,7 +226,7 @@ ARMS: Mapping[str, Arm] = {
             "an occluder at the end means: abstain",
             "up to the last frame before the outcome is settled the control is seen, and some sampled frame of it "
             f"differs from the other world's in at least {SEEN_PX:.0f} pixels, so that what follows can be inferred",
-            must_answer,
+            questions_to_answer,
             _late_occluder,
         ),
         Arm(
@@ -234,7 +234,7 @@ ARMS: Mapping[str, Arm] = {
             "a short clip means: abstain",
             "the control's last frames before it closes, as many as the void has, from which the observer answers "
             "rightly",
-            must_answer,
+            questions_to_answer,
             _length_matched,
         ),
         Arm(
@@ -242,7 +242,7 @@ ARMS: Mapping[str, Arm] = {
             "a cut means: abstain",
             f"the control is cut up to {LEAD_FRAMES[0]} frames before its outcome is settled, where at least "
             f"{AGREE_SHARE:.0%} of {FUTURES} futures of the last frame, perturbed as for `open`, end in the answer",
-            must_answer,
+            questions_to_answer,
             _predictable_cut,
         ),
         Arm(

@@ -12,7 +12,7 @@ from traps_pipeline.protocol.datasets import GRADED
 from traps_pipeline.scenes.certification.certificates import earliest_cut, futures_of
 from traps_pipeline.scenes.certification.ensemble import READ_OVER_S, UNSEEN_PX
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.variants.arms import Arm, Scenario, Take, must_answer
+from traps_pipeline.scenes.variants.arms import Arm, Scenario, Take, questions_to_answer
 from traps_pipeline.scenes.worlds.outcome import Rejected
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
@@ -33,13 +33,13 @@ def target_probability(spec: SceneSpec) -> float:
 
 
 def probabilities(counts: Counter[str | None]) -> dict[str, float]:
-    """Return the share of each answer among decided futures, the commonest first."""
+    """Return by answer its share among decided futures, the commonest first."""
     answers = {label: n for label, n in counts.most_common() if label is not None}
     return {label: n / sum(answers.values()) for label, n in answers.items()}
 
 
 def graded_cut(spec: SceneSpec, control: World) -> tuple[int, dict[str, Any]]:
-    """Return the cut nearest to the target probability. Raises Rejected.
+    """Return the frame and evidence of the cut nearest to the target probability. Raises Rejected.
 
     A cut ends with a frame that 5 frames a second show, not after the outcome is settled. The later it is, the more
     futures agree, so it is sought by halving.
@@ -81,6 +81,6 @@ GRADED_CUT = Arm(
     f"of {FUTURES} states at the cut that no viewer tells apart (places differ by {UNSEEN_PX} px, speeds by what that "
     f"is over {READ_OVER_S} s, one standard deviation) at least {MIN_DECIDED:.0%} end in an answer within {BEYOND_S:g} "
     "s after the clip; their shares are the answers' probabilities",
-    must_answer,
+    questions_to_answer,
     _film,
 )

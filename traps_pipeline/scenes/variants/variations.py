@@ -19,7 +19,7 @@ from traps_pipeline.scenes.parts.wording import choices_in, match_slots
 from traps_pipeline.scenes.physics.kit import list_choices
 from traps_pipeline.scenes.picture import checks
 from traps_pipeline.scenes.picture.render import Renderer
-from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, must_answer
+from traps_pipeline.scenes.variants.arms import SEEN_PX, Arm, Question, Scenario, Take, questions_to_answer
 from traps_pipeline.scenes.worlds.outcome import Rejected, compile_scene, moving_geoms
 from traps_pipeline.scenes.worlds.spec import SceneSpec
 from traps_pipeline.scenes.worlds.world import World
@@ -37,7 +37,7 @@ PALETTE = ("red", "green", "blue", "yellow", "orange", "cyan", "purple")  # colo
 
 
 def with_labels(spec: SceneSpec, count: int) -> tuple[str, tuple[str, ...]]:
-    """Return the scenario's question with `count` choices, and these. Raises Rejected.
+    """Return the scenario's question with `count` choices, and these choices. Raises Rejected.
 
     The answer and that of the twin, the other world behind the same void, are always among them, so that the void stays
     open; then come the question's own choices, and then colours that it does not name. Raises Rejected where the
@@ -98,7 +98,7 @@ def _offered(scenario: Scenario) -> Take:
 
 @dataclass(frozen=True)
 class Look:
-    """An occluder's look. colour: RGB or None; alpha: 1 is opaque; wide: a factor."""
+    """The look of an occluder. colour: RGB or None; alpha: 1 is opaque; wide: a factor."""
 
     colour: tuple[float, float, float] | None = None
     alpha: float = 1.0
@@ -123,13 +123,13 @@ def _void_with(scenario: Scenario, look: Look) -> Take:
     control, twin = scenario.control, scenario.twin
     moving_names = moving_geoms(control.model)
     with _renderer(control, look) as renderer:
-        frames = list(checks.void_frames(renderer, control.qpos))
+        frames = list(checks.occluded_frames(renderer, control.qpos))
         shown_px = float(renderer.visible_pixels(control.qpos[:1], ["occluder"], occluder=True)[0, 0])
         cause = float(
             renderer.visible_pixels(control.qpos[scenario.sampled], moving_names, occluder=True).sum(axis=1).max()
         )
     with _renderer(twin, look) as renderer:
-        n_differing, levels = checks.differing_pixels(frames, checks.void_frames(renderer, twin.qpos))
+        n_differing, levels = checks.differing_pixels(frames, checks.occluded_frames(renderer, twin.qpos))
     if n_differing:
         raise Rejected(
             f"behind this occluder the two worlds differ in {n_differing} pixels, by {levels} levels at most"
@@ -165,9 +165,9 @@ def _sheer(alpha: float) -> Callable[[Scenario], Take]:
         """Return a clip whose sheer occluder shows the outcome. Raises Rejected."""
         look, last = Look(alpha=alpha), checks.last_sampled(len(scenario.control.qpos), scenario.fps)
         with _renderer(scenario.control, look) as renderer:
-            frames = list(checks.void_frames(renderer, scenario.control.qpos))
+            frames = list(checks.occluded_frames(renderer, scenario.control.qpos))
         with _renderer(scenario.twin, look) as renderer:
-            twin_frames = list(checks.void_frames(renderer, scenario.twin.qpos))
+            twin_frames = list(checks.occluded_frames(renderer, scenario.twin.qpos))
         gaps = [np.abs(frames[k].astype(np.int16) - twin_frames[k]).max(axis=2) for k in last]
         n_noticed, levels = (max(int((gap >= SEEN_LEVELS).sum()) for gap in gaps), max(int(gap.max()) for gap in gaps))
         evidence = {"alpha": alpha, "seen_through_px": n_noticed, "levels": levels}
@@ -243,7 +243,8 @@ def _variation(name: str) -> Arm:
     if name in OCCLUDER_LOOKS:
         return Arm(name, _CHANGES[name], _SAME_VOID, _must_abstain, _FILMED[name])
     if name in OCCLUDER_DOSES:
-        return Arm(name, f"the occluder has alpha {_ALPHAS[name]:g}", _SEEN_THROUGH, must_answer, _sheer(_ALPHAS[name]))
+        alpha = _ALPHAS[name]
+        return Arm(name, f"the occluder has alpha {alpha:g}", _SEEN_THROUGH, questions_to_answer, _sheer(alpha))
     promises = {
         "frames_later": f"the last {END_S:g} s as shown then show the settled outcome legibly; a void hides it in all",
         "frames_few": "that of the pair, which holds for this rate",

@@ -19,7 +19,7 @@ from traps_pipeline.base.files import write_bytes
 from traps_pipeline.base.paths import PACKAGE, user_cache
 from traps_pipeline.scenes.family_registry import added_digests
 from traps_pipeline.scenes.picture.render import RenderingUnavailable, renderer_version
-from traps_pipeline.scenes.worlds.clip_notes import note_of, read_clip, read_note
+from traps_pipeline.scenes.worlds.clip_notes import clip_note_path, read_clip, read_note
 from traps_pipeline.video.encode import DamagedClip
 
 VARIABLE = "TRAPS_CLIP_CACHE"  # at most so many GB, or "off"
@@ -62,7 +62,7 @@ class ClipCache:
             if not entry.is_file():
                 return False
             note = read_note(entry)
-            content, note_content = entry.read_bytes(), note_of(entry).read_bytes()
+            content, note_content = entry.read_bytes(), clip_note_path(entry).read_bytes()
             if note is None or sha256(content).hexdigest() != note.file_sha256:
                 raise DamagedClip(f"{entry}: is not what was rendered")
             os.utime(entry)  # used last
@@ -70,7 +70,7 @@ class ClipCache:
             _remove(entry)
             return False
         write_bytes(clip, content)
-        write_bytes(note_of(clip), note_content)
+        write_bytes(clip_note_path(clip), note_content)
         return True
 
     def keep(self, clips: Iterable[Path], scene_hash: str) -> None:
@@ -81,7 +81,7 @@ class ClipCache:
                 return
             try:
                 if not entry.is_file() and read_clip(clip) is not None:
-                    write_bytes(note_of(entry), note_of(clip).read_bytes())
+                    write_bytes(clip_note_path(entry), clip_note_path(clip).read_bytes())
                     write_bytes(entry, clip.read_bytes())  # last: it is what `bring` looks for
             except (DamagedClip, TrapsError, OSError):
                 _remove(entry)
@@ -117,14 +117,14 @@ class ClipCache:
         for path in self.folder.glob("??/*.mp4"):
             try:
                 status = path.stat()
-                entries.append((status.st_mtime, status.st_size + note_of(path).stat().st_size, path))
+                entries.append((status.st_mtime, status.st_size + clip_note_path(path).stat().st_size, path))
             except OSError:  # another process removes it
                 continue
         return entries
 
 
 def _remove(entry: Path) -> None:
-    for path in (entry, note_of(entry)):
+    for path in (entry, clip_note_path(entry)):
         try:
             path.unlink(missing_ok=True)
         except OSError:

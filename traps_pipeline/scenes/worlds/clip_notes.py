@@ -14,7 +14,7 @@ from traps_pipeline.video.encode import DamagedClip, encode, frames_digest
 
 @dataclass(frozen=True)
 class Clip:
-    """An encoded clip. leaked_pixels: visible pixels of hidden things; None without occluder."""
+    """A clip's note: digest, size and length. leaked_pixels: visible pixels of hidden things; None without occluder."""
 
     file_sha256: str
     frames_sha256: str
@@ -36,8 +36,8 @@ def _seal_of(clip: Clip) -> str:
     return digest(asdict(clip))[:16]
 
 
-def note_of(clip: Path) -> Path:
-    """Return the path of a clip's note, JSON that is written last and vouches for it."""
+def clip_note_path(clip: Path) -> Path:
+    """Return the path of a clip's note (JSON), which is written last and vouches for the clip."""
     return clip.with_suffix(".json")
 
 
@@ -51,16 +51,16 @@ def read_clip(path: Path) -> Clip | None:
 
 def read_note(path: Path) -> Clip | None:
     """Return the content of a clip's note, None if there is none. Raises DamagedClip."""
-    if not note_of(path).is_file():
+    if not (note_path := clip_note_path(path)).is_file():
         return None
     try:
-        note = json.loads(note_of(path).read_text(encoding="utf-8"))
+        note = json.loads(note_path.read_text(encoding="utf-8"))
         seal = note.pop(_SEAL, None)  # notes of version 0.1.0 have none
         clip = Clip(**note)
         if seal not in (None, _seal_of(clip)):
             raise ValueError("it was altered")
     except (ValueError, TypeError, AttributeError) as error:
-        raise DamagedClip(f"{note_of(path)}: is not what was written ({error}); delete it and run again") from error
+        raise DamagedClip(f"{note_path}: is not what was written ({error}); delete it and run again") from error
     return clip
 
 
@@ -78,5 +78,5 @@ def save_clip(path: Path, frames: Sequence[np.ndarray], fps: int, leaked_pixels:
     """Encode frames, write the note that vouches for them, and return their number."""
     encode(frames, path, fps)
     clip = Clip(file_digest(path), frames_digest(frames), len(frames), fps, path.stat().st_size, leaked_pixels)
-    write_text(note_of(path), json.dumps(asdict(clip) | {_SEAL: _seal_of(clip)}))
+    write_text(clip_note_path(path), json.dumps(asdict(clip) | {_SEAL: _seal_of(clip)}))
     return len(frames)

@@ -1,4 +1,4 @@
-"""Simulate a lane's event by itself, as if there were no other lane."""
+"""Simulate the event of one of two lanes by itself, as if there were no other lane."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class LaneEvent:
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled scene."""
+        """The compiled MuJoCo model of the scene."""
         return self._compiled[0]
 
     @property
     def scene(self) -> Scene:
-        """The built scene."""
+        """The built scene: the roles of its parts."""
         return self._compiled[1]
 
     @property
@@ -70,7 +70,7 @@ class LaneEvent:
         return np.concatenate([swept_points(self.model, self.qpos), *geom_corners(self.model).values(), *framed])
 
     def copied_geoms(self, body: str) -> list[str]:
-        """Return the geoms that a body's double has: all but those of the hidden element, unless it has no other."""
+        """Return the geom names of a body's double: all but those of the hidden element, unless it has no other."""
         model, number = self.model, self.model.body(body).id
         names = [model.geom(int(i)).name for i in np.flatnonzero(model.geom_bodyid == number)]
         return [name for name in names if name not in self.scene.hidden] or names

@@ -12,7 +12,7 @@ from traps_pipeline.scenes.physics.kit import Box, Vec3
 from traps_pipeline.scenes.picture.camera import Camera, Occluder, WideCamera, fit_camera, fit_occluder
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent, middle_of
 from traps_pipeline.scenes.worlds.shot import box_around
-from traps_pipeline.scenes.worlds.timetable import Timetable
+from traps_pipeline.scenes.worlds.timetable import WINDOW_S, Timetable
 
 SIDES = (-1, 1)  # of the world's middle, on which the left and the right lane are
 GAP_M = 0.14  # between the lanes
@@ -30,13 +30,13 @@ Path = tuple[tuple[float, float], ...]  # along and above the bench's middle, in
 
 @dataclass(frozen=True)
 class Lane:
-    """What is drawn of a lane.
+    """The drawn settings of a lane, one of two strips of the picture that each show an event.
 
     strip: its colour. bench_above: whether the bench is above the scene in the picture. bench_at: where it is along the
     lane, 0 to 1. mirrored: whether doubles come from the other side than what they are doubles of. rests_at: how far
     they get, 0 to 1. sets_out_s: when those set out that are behind the board from the start. size: of doubles, 1 for
     that of the things themselves. boards: widths of those before scene and bench, 1 for the least. timetable: of
-    the board that comes and goes.
+    the board that comes and goes. window_s: for how long that shows the settled outcome, at least.
     """
 
     strip: str
@@ -48,11 +48,12 @@ class Lane:
     size: float
     boards: tuple[float, float]
     timetable: Timetable
+    window_s: float = WINDOW_S
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things of a lane are, in the world.
+    """The places of a lane's parts in the world.
 
     shift: of the family's own scene. bench: the middle of the bench's upper face. bench_half: across, and in depth.
     boards: before the scene, and before the bench. paths: of the middle of each double's foot.
@@ -179,6 +180,8 @@ def _double_paths(
     inner, top, paths = board.half[0] * scale - BENCH_EDGE_M, 2 * board.half[2] * scale, list[np.ndarray]()
     total = sum(float(np.ptp(span[:, 0])) + CLEAR_M for span in doubles.values())
     used = -total / 2
+    starts = [event.motion.pos(body)[0, 0] + shift[0] - board.centre[0] for body in doubles]
+    are_facing = min(starts) < 0 < max(starts)
     for n, (body, span) in enumerate(doubles.items()):
         width, _, tall = (float(size) for size in np.ptp(span, axis=0))
         place = event.motion.pos(body) + np.array(shift) + (middle_of(span[:, 0]), 0.0, span[:, 2].min())
@@ -188,9 +191,10 @@ def _double_paths(
         if abs(along[0]) > room + CLEAR_M:  # it comes along
             first = int((np.abs(along) <= room).argmax())
             speed = max(abs(along[first] - along[first - 1]), 0.004)
-            far = 2 * room * (0.2 + 0.6 * lane.rests_at) - n * (width + CLEAR_M)
-            behind = along[first] - np.sign(along[0]) * _slowing(frames - first, far, speed)
-            path[:, 0] = np.where(frames < first, along, behind)
+            far, side = 2 * room * (0.2 + 0.6 * lane.rests_at) - n * (width + CLEAR_M), float(np.sign(along[0]))
+            if are_facing:  # they come to lie beside each other, and none passes through another
+                far = side * (along[first] - room * (lane.rests_at - 0.5)) - (width + CLEAR_M) / 2
+            path[:, 0] = np.where(frames < first, along, along[first] - side * _slowing(frames - first, far, speed))
         elif is_over[0]:  # it comes down
             first = int((~is_over).argmax())
             fallen = (above[first - 1] - above[first]) * (frames - first) + 4.9 * ((frames - first) / fps) ** 2

@@ -27,7 +27,7 @@ class _Record(BaseModel):
 
 
 class LaneTwin(_Record):
-    """A lane's other world: what differs, its answer, the digest of the trajectory with it."""
+    """The other world of a lane: what differs, its answer, the digest of the trajectory with it."""
 
     params: dict[str, Any]
     ground_truth: str
@@ -147,7 +147,7 @@ def _asked(question: str, record: LaneRecord | RecordedLane) -> str:
 
 @dataclass(frozen=True)
 class LaneQuestion:
-    """An item's question, and what its lane ends in, hidden or not."""
+    """The question of an item of two events, and what its lane ends in, hidden or not."""
 
     item: LaneItem
     text: str

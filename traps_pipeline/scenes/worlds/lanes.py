@@ -22,7 +22,7 @@ import numpy as np
 
 from traps_pipeline.protocol.two_events import LANES
 from traps_pipeline.scenes.parts.look import Look, apply_look
-from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, Vec3, View, add_box, new_spec
+from traps_pipeline.scenes.physics.kit import Motion, Physics, Scene, Vec3, View, add_box, flag_of, new_spec
 from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture.camera import Camera, Occluder
 from traps_pipeline.scenes.worlds.lane_event import LaneEvent, middle_of
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 PLACES = ("scene", "bench")  # what a lane's two boards are before
 LEG_M = 0.012  # half width of a bench's leg
 BENCH_RGBA = (0.36, 0.33, 0.36, 1.0)  # of no colour that a question names
+FLAG_CLEAR_PX = 2.0  # of flags, over the board before a scene
 AWAY_M = 60.0  # so high hangs a board that is not there
 
 
@@ -70,7 +71,9 @@ class TwoLanes:
         apply_look(Scene(spec, View(), (), tuple(layout.strip for layout in self.layouts)), self.look)
         for name, lane, event, layout in zip(LANES, self.lanes, self.events, self.layouts, strict=True):
             frame = spec.worldbody.add_frame(pos=list(layout.shift))
-            spec.attach(_lane_spec(event, layout, lane.size), prefix=f"{name} ", frame=frame)
+            lane_spec = _lane_spec(event, layout, lane.size)
+            _raise_flags(lane_spec, event, layout, self.camera)
+            spec.attach(lane_spec, prefix=f"{name} ", frame=frame)
             _paint(spec, name, lane.strip, layout)
         for name, layout in zip(LANES, self.layouts, strict=True):  # last: the last columns of a pose are theirs
             for place, board in zip(PLACES, layout.boards, strict=True):
@@ -127,7 +130,7 @@ class TwoLanes:
         return decisive_geoms(self.model, [f"{LANES[lane]} {body}" for body in self.events[lane].scene.decisive])
 
     def hidden_element(self, lane: int) -> tuple[str, ...]:
-        """Return the names of the geoms of a lane's hidden element that are no decisive ones."""
+        """Return the names of the geoms of a lane's hidden element that are not decisive ones."""
         names = [f"{LANES[lane]} {name}" for name in self.events[lane].scene.hidden]
         return tuple(name for name in names if name not in self.decisive(lane))
 
@@ -175,6 +178,21 @@ def _lane_spec(event: LaneEvent, layout: Layout, size: float) -> mujoco.MjSpec:
         for name in event.copied_geoms(body):
             _copy_geom(spec, double, spec.geom(name), f"double {n} {name}", size)
     return spec
+
+
+def _raise_flags(spec: mujoco.MjSpec, event: LaneEvent, layout: Layout, camera: Camera) -> None:
+    """Raise a lane's flags together until the board before its scene hides none of them."""
+    flags = [spec.geom(flag_of(mark)) for mark in event.scene.marks]
+    feet = [np.array(flag.pos) + layout.shift - (0.0, 0.0, flag.size[2]) for flag in flags]
+    edge = camera.project(layout.boards[0].corners())[:, 1].min() - FLAG_CLEAR_PX
+    down = float(np.cos(np.radians(camera.elevation_deg)))
+    lifts = [float(camera.project(foot)[0, 1] - edge) * camera.metres_a_pixel(foot) / down for foot in feet]
+    lift = max([0.0, *lifts])
+    for mark in event.scene.marks:
+        for part in (flag_of(mark), f"rim {mark}"):
+            spec.geom(part).pos[2] += lift
+        mast = spec.geom(f"mast {mark}")
+        mast.pos[2], mast.size[1] = mast.pos[2] + lift / 2, mast.size[1] + lift / 2
 
 
 def _copy_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, geom: mujoco.MjsGeom, name: str, size: float) -> None:

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 class Rejected(ValueError):
-    """These parameters make no valid pair; the message says why."""
+    """Raised where parameters make no valid pair; the message says why."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a run, before it is certified.
+    """The outcome that a simulation ends in, before it is certified.
 
     label: None if it is undecided at the end. commit_frame: first frame from which the label holds to the end (the
     number of frames if it is undecided). margin_m: distance (m) of the end from the nearest other outcome. in_order,
@@ -40,7 +40,7 @@ class Outcome:
 
     @property
     def answer(self) -> str:
-        """The label. Raises Rejected if the outcome is undecided."""
+        """The label of the outcome. Raises Rejected if it is undecided."""
         if self.label is None:
             raise Rejected("the outcome is undecided at the end of the control")
         return self.label
@@ -98,7 +98,7 @@ def moving_geoms(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def decisive_geoms(model: mujoco.MjModel, bodies: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the geoms of some bodies, and of those that are soft."""
+    """Return the names of the geoms that belong to any of these bodies, and of the soft ones among them."""
     soft_bodies = flexes(model)
     ids = {model.body(name).id for name in bodies if name not in soft_bodies}
     geoms = (model.geom(i).name for i in range(model.ngeom) if int(model.geom_bodyid[i]) in ids)

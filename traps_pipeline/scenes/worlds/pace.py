@@ -33,7 +33,7 @@ def settles_share(commit_frame: int, n_frames: int) -> float:
 
 
 def out_of_pace(share: float) -> str | None:
-    """Return why an outcome settles too early or late in a clip, in words."""
+    """Return in words why an outcome settles too early or late in a clip; None if it does not."""
     if share < EARLIEST_SHARE:
         return f"the outcome settles after {share:.0%} of the clip, {EARLIEST_SHARE:.0%} is wanted"
     if share > LATEST_SHARE:
@@ -54,7 +54,7 @@ def _counting_worlds(worlds: Sequence[World]) -> Sequence[World]:
 
 
 def lengths(worlds: Sequence[World], seed: int) -> list[int]:
-    """Return numbers of frames to try for a clip of simulated worlds, best first.
+    """Return the numbers of frames to try for a clip of simulated worlds, best first.
 
     Those are all that there are, or, where the outcome of one world is early, an even number drawn by seed, and then
     the most.
@@ -72,7 +72,7 @@ def lengths(worlds: Sequence[World], seed: int) -> list[int]:
 
 
 def moments(worlds: Sequence[World], seed: int) -> Iterator[int]:
-    """Yield frames at which a control may close; none if it cannot.
+    """Yield the frames at which an occluder may close a control; none if it cannot.
 
     All outcomes have been in view and at rest for long enough; after those, or where there is no time for that, comes
     the last possible frame.

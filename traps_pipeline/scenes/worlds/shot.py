@@ -22,7 +22,7 @@ def shown_points(model: mujoco.MjModel, scene: Scene, qpos: np.ndarray) -> np.nd
 
 
 def shot_of(worlds: Sequence[World]) -> tuple[Camera, Occluder | None]:
-    """Return the nearest camera with all worlds in frame, and the least occluder.
+    """Return the nearest camera with all worlds in frame, and the smallest occluder that hides them.
 
     It covers what any world must hide; None if some world has nothing to cover.
     """

@@ -33,7 +33,7 @@ Angle = Annotated[float, Field(ge=-720, le=720)]  # degrees
 
 
 class Footage(_Strict):
-    """What a record says of its clips' length."""
+    """The length of a record's clips in seconds, and their frames per second."""
 
     duration_s: float = Field(ge=1, le=60)
     fps: int = Field(ge=1, le=60)
@@ -117,7 +117,7 @@ def check_labels(labels: Sequence[str], aliases: Mapping[str, str], answers: Ite
 
 
 class Answerable(BaseModel):
-    """A question that both videos of the pair answer."""
+    """A question that both videos of the pair answer, with its labels and its answer."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     question: str = Field(min_length=1)
@@ -221,7 +221,7 @@ class SceneSpec(BaseModel):
 
     @property
     def scene_hash(self) -> str:
-        """Digest of the clips' content; a corrected question does not change it."""
+        """The digest of the clips' content; a corrected question does not change it."""
         parts = ("family", "params", "physics", "camera", "void_kind", "void", "control", "trajectory_sha256", "twin")
         record = self.model_dump(mode="json", include=set(parts))
         return digest(record)

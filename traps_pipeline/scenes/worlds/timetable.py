@@ -1,4 +1,4 @@
-"""Let boards stand, come and go: by a timetable, and always for a window that shows what they stood before."""
+"""Decide when the boards of a lane stand, come and go, and when they show what they hide."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,23 @@ import numpy as np
 from traps_pipeline.video.policies import fewest_within
 
 MOVES_FRAMES = 4  # that a board takes to come or to go (0.4 s)
-WINDOW_FRAMES = 10  # least time without the board, once the outcome has settled (1 s)
-WINDOW_SHOWN = 2  # frames of the window that each model is shown, at least
+WINDOW_S = 1.0  # least time without the board, once the outcome has settled, but where a draw says less
+WINDOW_SHOWN = 2  # frames of such a window that each model is shown, at least
 
 
 @dataclass(frozen=True)
 class Timetable:
-    """When a board stands: spans of frames [start, stop), ascending, with a move before and after each.
+    """The times at which a board stands: spans of frames [start, stop), with a move before and after each.
 
     A span that begins at frame 0, or ends with the clip, has no move there.
     """
 
     spans: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of_window(cls, first: int, frames: int, n_frames: int) -> "Timetable":
+        """Return the timetable by which the board is away for some frames alone."""
+        return cls(((0, first - MOVES_FRAMES + 1), (first + frames + MOVES_FRAMES - 1, n_frames)))
 
     def away(self, n_frames: int) -> np.ndarray:
         """Return how far away the board is in each frame, 0 (it stands) to 1 (it is gone), (F,)."""
@@ -35,7 +40,8 @@ class Timetable:
         run = max(runs, key=len)
         return (int(run[0]), int(run[-1]) + 1) if len(run) else (first, first)
 
-    def shows(self, first: int, n_frames: int, fps: int) -> bool:
-        """Return whether a window from a frame on is long enough, for each model too."""
+    def shows(self, first: int, n_frames: int, fps: int, window_s: float = WINDOW_S) -> bool:
+        """Return whether a window from a frame on is long enough, for each model too where it is not a short one."""
         start, stop = self.window(first, n_frames)
-        return stop - start >= WINDOW_FRAMES and fewest_within(n_frames, fps, (start, stop)) >= WINDOW_SHOWN
+        least = WINDOW_SHOWN if window_s >= WINDOW_S else 0
+        return stop - start >= round(window_s * fps) and fewest_within(n_frames, fps, (start, stop)) >= least

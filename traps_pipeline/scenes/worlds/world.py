@@ -14,7 +14,7 @@ from traps_pipeline.scenes.physics.flexes import flexes
 from traps_pipeline.scenes.physics.kit import Family, Inventory, Motion, Physics, Scene
 from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture.camera import Camera, Closing, Occluder
-from traps_pipeline.scenes.picture.checks import PastOccluder, differing_pixels, void_frames
+from traps_pipeline.scenes.picture.checks import PastOccluder, differing_pixels, occluded_frames
 from traps_pipeline.scenes.picture.coming_board import Coming, coming_board
 from traps_pipeline.scenes.picture.render import SUPERSAMPLE, Renderer
 from traps_pipeline.scenes.worlds.outcome import (
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A scene with its trajectory and its shot.
+    """A scene with its trajectory, and the camera and occluder of its pair (its shot).
 
     qpos: the trajectory (F, nq). occluder: the occluder of its void, None where the void is a cut. frame_step: pixel
     evidence looks at every so many frames. simulated: the trajectory that simulating gives here, where it is known.
@@ -94,17 +94,17 @@ class World:
 
     @property
     def open_frames(self) -> int:
-        """Number of frames of the control before an occluder comes; all if none does."""
+        """The number of frames of the control before an occluder comes; all if none does."""
         return len(self.qpos) if self.closing is None else self.closing.frame
 
     @cached_property
     def board(self) -> Coming:
-        """Offsets of the board that closes the control, by frame."""
+        """The offset of the board that closes the control, by frame."""
         return coming_board(self.closing, self.camera, len(self.qpos), self.physics.fps)
 
     @cached_property
     def motion(self) -> Motion:
-        """Poses of all bodies, replayed."""
+        """The poses of all bodies, replayed from the trajectory."""
         return replay(self.model, self.qpos, self.physics)
 
     @cached_property
@@ -114,7 +114,7 @@ class World:
 
     @property
     def outcome_read(self) -> Outcome:
-        """The outcome that the frames before the closing show by themselves."""
+        """The outcome that the frames before the closing occluder show by themselves."""
         open_frames, motion = slice(0, self.open_frames), self.motion
         parts = (
             {k: v[open_frames] for k, v in poses.items()}
@@ -124,19 +124,19 @@ class World:
 
     @cached_property
     def resimulated(self) -> np.ndarray:
-        """The trajectory that simulating gives here, (F, nq). Raises Rejected."""
+        """The trajectory that simulating on this machine gives, (F, nq). Raises Rejected."""
         if self.simulated is not None:
             return self.simulated
         return simulated(*compile_scene(self.family, self.params, self.physics), self.physics)
 
     @property
     def same_physics(self) -> bool:
-        """Whether simulating here gives the trajectory bit by bit."""
+        """Whether simulating on this machine gives the trajectory bit by bit."""
         return np.array_equal(self.resimulated, self.qpos)
 
     @property
     def evidence_frames(self) -> range:
-        """The frames that pixel evidence looks at."""
+        """The indices of the frames that pixel evidence looks at."""
         return range(0, len(self.qpos), self.frame_step)
 
     def renderer(self, *, supersample: int = SUPERSAMPLE) -> Renderer:
@@ -145,12 +145,12 @@ class World:
 
     @property
     def concealed_geoms(self) -> tuple[str, ...]:
-        """Geoms of decisive bodies and the hidden element, which the void must not show."""
+        """The names of the geoms of decisive bodies and the hidden element, which the void must not show."""
         return (*decisive_geoms(self.model, self.scene.decisive), *self.scene.hidden)
 
     @property
     def closed_geoms(self) -> tuple[str, ...]:
-        """Geoms hidden by closing: the concealed ones, or all that move (cut scene)."""
+        """The names of the geoms that closing must hide: concealed ones, or in a cut scene all that move."""
         return moving_geoms(self.model) if self.occluder is None else self.concealed_geoms
 
     @cached_property
@@ -161,18 +161,18 @@ class World:
 
     @property
     def closed_frames(self) -> list[int]:
-        """The closed control's frames that pixel evidence looks at, the last included."""
+        """The indices of the closed control's frames that pixel evidence looks at, the last included."""
         return sorted(range(len(self.qpos) - 1, self.open_frames - 1, -self.frame_step))
 
     # What is drawn behind the occluder, that of the void or the one that closes the control, is needed by several
     # certificates; each frame is drawn once.
 
     def behind_occluder(self, frames: Sequence[int]) -> list[np.ndarray]:
-        """Return some frames of the world behind its occluder."""
+        """Return some frames of the world drawn with the void's occluder."""
         missing = [frame for frame in frames if frame not in self._behind]
         if missing:
             with self.closed_renderer() as renderer:
-                self._behind.update(zip(missing, void_frames(renderer, self.qpos[missing]), strict=True))
+                self._behind.update(zip(missing, occluded_frames(renderer, self.qpos[missing]), strict=True))
         return [self._behind[frame] for frame in frames]
 
     @cached_property
@@ -180,7 +180,7 @@ class World:
         return {}
 
     def pixels_of(self, names: Sequence[str], frames: Sequence[int] | None = None) -> np.ndarray:
-        """Return the pixels that geoms have together behind the occluder, by frame, (F,)."""
+        """Return the number of pixels that geoms have together behind the occluder, by frame, (F,)."""
         frames = self.evidence_frames if frames is None else frames
         missing = [frame for frame in frames if frame not in self._segmented]
         if missing:
@@ -195,12 +195,12 @@ class World:
         return {}
 
     def ablation_px(self, frames: Sequence[int], geoms: tuple[str, ...]) -> int:
-        """Return how many pixels of some frames change when geoms are taken away."""
+        """Return how many pixels of some frames change when geoms are not drawn."""
         missing = [frame for frame in frames if (frame, geoms) not in self._ablated]
         if missing:
             complete_frames = self.behind_occluder(missing)
             with self.closed_renderer() as renderer:
-                ablated_frames = void_frames(renderer, self.qpos[missing], without=geoms)
+                ablated_frames = occluded_frames(renderer, self.qpos[missing], without=geoms)
                 for frame, ablated, unablated in zip(missing, complete_frames, ablated_frames, strict=True):
                     self._ablated[frame, geoms] = differing_pixels([ablated], [unablated])[0]
         return sum(self._ablated[frame, geoms] for frame in frames)
@@ -211,13 +211,13 @@ class World:
 
     @cached_property
     def past_occluder(self) -> PastOccluder:
-        """The pixels that are visible past the occluder."""
+        """The numbers of pixels that decisive bodies and the hidden element show past the occluder."""
         decisive = decisive_geoms(self.model, self.scene.decisive)
         return PastOccluder(self.pixels_of(decisive), self.pixels_of(self.scene.hidden))
 
     @property
     def void_frames(self) -> list[np.ndarray]:
-        """The frames of the world behind the occluder of its void."""
+        """The frames, drawn with the void's occluder, that pixel evidence looks at."""
         return self.behind_occluder(self.evidence_frames)
 
     def closed_renderer(self) -> Renderer:
@@ -226,7 +226,7 @@ class World:
 
 
 def closing_of(spec: SceneSpec) -> Closing | None:
-    """Return the closing of a record's control."""
+    """Return the closing of a record's control (from when an occluder stands); None if none comes."""
     if spec.control is None:
         return None
     occluder = (spec.void if spec.void_kind == "occluder" else spec.control)["panel"]
