@@ -73,7 +73,7 @@ def claims(results: Results) -> Figure:
             heads = [SUBJECT_NAMES[name].replace(" ", "\n", 1) for name in SUBJECTS]
             ax.set_xticks(range(len(heads)), heads, size=6)
             ax.xaxis.tick_top()
-            ax.set(xlim=(-0.5, len(heads) + 1.8), ylim=(len(part) - 0.5, -0.5))
+            ax.set(xlim=(-0.5, len(heads) + 1.9), ylim=(len(part) - 0.5, -0.5))
             ax.tick_params(length=0, which="both")
             ax.spines[:].set_visible(False)
             n_held = sum(row["verdict"] == "holds" for row in part)
