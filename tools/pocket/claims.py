@@ -46,6 +46,6 @@ def markdown(gap: Sequence[Figure], no_gap: Sequence[Figure]) -> str:
             continue
         worst = {name: min(of) if name == MODEL else max(of) for name, of in values.items() if of}
         cells = [", ".join(f"{value:.2f}" for value in values[name]) or "–" for name in subjects]
-        columns = [claim.says, f"{claim.metric} ≥ {claim.bound:g}", *cells, verdict(claim, worst)]
+        columns = [claim.says, claim.holds_if, *cells, verdict(claim, worst)]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)

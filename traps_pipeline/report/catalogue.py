@@ -263,21 +263,18 @@ def folder(kind: str, results: Results) -> str:
 
 
 def _say_below(figure: Figure, text: str) -> None:
-    """Write lines at a figure's foot, or along its right edge if there is no room."""
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
+    """Write lines at a figure's foot, or above its legend's keys; along its right edge if nothing may move."""
     from traps_pipeline.report.writing import SOFT, figure_style
 
     look: dict[str, Any] = {"fontsize": 6, "color": SOFT, "parse_math": False}
-    engine = figure.get_layout_engine()
     with figure_style():
-        if engine is not None and not figure.legends:
+        if figure.get_layout_engine() is None:
+            figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
+        elif figure.legends:
+            caption = figure.legends[0].get_title().get_text()
+            figure.legends[0].set_title(f"{caption}\n{text}".strip())
+        else:
             figure.supxlabel(text, x=0.99, ha="right", **look)
-            return
-        if isinstance(engine, ConstrainedLayoutEngine):
-            edge_in = RIGHT_EDGE_IN * (1 + text.count("\n"))
-            engine.set(rect=(0, 0, 1 - edge_in / figure.get_figwidth(), 1))
-        figure.text(0.995, 0.5, text, rotation=90, ha="right", va="center", **look)
 
 
 def _function(name: str) -> Callable[..., Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +13,10 @@ from traps_pipeline.base.paths import ASSETS
 from traps_pipeline.mechanism.control_rows import LOGITS, MODEL, RESIDUAL, STATES
 from traps_pipeline.mechanism.effects import two_sided_effects
 from traps_pipeline.mechanism.probes import auroc
+from traps_pipeline.mechanism.transfer_paths import LOOK_ALIKES
 from traps_pipeline.protocol.datasets import DATASETS, is_ill_posed
 from traps_pipeline.protocol.regimes import GUIDED, RANDOM_WEIGHTS, STANDARD
+from traps_pipeline.report.numbers import NONE
 from traps_pipeline.report.result_frames import Results
 from traps_pipeline.report.tables.control_reports import OTHER_GATES, leads, prompts
 from traps_pipeline.report.tables.inside_columns import why_not
@@ -45,8 +47,8 @@ class Claim:
     """A claim about a model's hidden states: the metric that decides it, and controls in which it must fail.
 
     metric: what is measured; it holds from `bound` on. of: the metric of a model and subject, None where the study has
-    none, NaN where the subject's states do not vary. fails_in: the controls in which the metric must stay below the
-    bound. instead: by subject, the words that stand in place of a metric that no study has.
+    none, NaN where the subject's states do not vary; of RIVAL, in a claim of a lead, what is subtracted. fails_in: the
+    controls in which the metric must stay below the bound. n_of: the frame, count columns and targets of its items.
     """
 
     name: str
@@ -55,7 +57,23 @@ class Claim:
     bound: float
     of: Callable[[Results, str, str], float | None]
     fails_in: Sequence[str]
-    instead: Mapping[str, str] = field(default_factory=dict)
+    n_of: tuple[str, Sequence[str], Sequence[str]] | None = None
+
+    @property
+    def holds_if(self) -> str:
+        """The measure and its bound."""
+        return f"{self.metric} ≥ {self.bound:g}"
+
+    def n(self, results: Results, model: str) -> float | None:
+        """Return of how many items of a model the metric is, over its targets; None if that is not known."""
+        if self.n_of is None:
+            return None
+        frame, columns, targets = self.n_of
+        rows = getattr(results, frame)
+        rows = rows.loc[rows["model"] == model]
+        key = rows[next((name for name in ("target", "dataset") if name in rows), "model")].astype(str)
+        is_target = key.isin(targets) if targets else key.notna()
+        return rows.loc[is_target, [*columns]].sum(axis=1).groupby(key[is_target]).max().sum() or None
 
 
 # --- metrics ----------------------------------------------------------------------------------------------------------
@@ -85,26 +103,31 @@ def subject_leads(results: Results, model: str, subject: str, targets: Sequence[
     return [part for _, part in rows.groupby(["target", "subject"], observed=True, sort=False)]
 
 
-def _by_features(metric: Callable[[Results, str, dict[str, float]], float], targets: Sequence[str]) -> Any:
-    """Return the metric of a subject's AUROC by features, mean over targets; of a placebo, the largest."""
+def _by_features(features: str, rival: Callable[[dict[str, float]], float] | None, targets: Sequence[str]) -> Any:
+    """Return the AUROC of a subject's features, less that of its best rival if there is one.
+
+    It is the mean over targets; of a placebo the largest; of RIVAL the mean of what is subtracted in the model.
+    """
 
     def of(results: Results, model: str, subject: str) -> float | None:
-        parts = subject_leads(results, model, subject, targets)
-        values = [
-            metric(results, str(part["target"].iloc[0]), dict(zip(part["features"], part["auroc"], strict=True)))
-            for part in parts
-        ]
+        values = []
+        for part in subject_leads(results, model, MODEL if subject == RIVAL else subject, targets):
+            areas = dict(zip(part["features"], part["auroc"], strict=True))
+            subtracted = rival(areas) if rival else 0.0
+            values.append(subtracted if subject == RIVAL else areas[features] - subtracted)
+        if subject == RIVAL and rival is None:
+            return None
         return max(values, default=None) if subject == PLACEBO else _mean(values)
 
     return of
 
 
-def _lead(results: Results, target: str, areas: dict[str, float]) -> float:
-    return areas[STATES] - max(value for name, value in areas.items() if name not in (STATES, RESIDUAL))
+def _best_rival(areas: dict[str, float]) -> float:
+    return max(value for name, value in areas.items() if name not in (STATES, RESIDUAL))
 
 
-def _beyond_output(results: Results, target: str, areas: dict[str, float]) -> float:
-    return areas[STATES] - max(areas.get(name, 0.5) for name in ("output margin", LOGITS))
+def _output(areas: dict[str, float]) -> float:
+    return max(areas.get(name, 0.5) for name in ("output margin", LOGITS))
 
 
 def _unexpressed(results: Results, model: str, subject: str) -> float | None:
@@ -122,7 +145,7 @@ def _sentences(results: Results, model: str, subject: str) -> float | None:
     """Return how much better states order the sides than an abstention against the own answer, in AUROC."""
     rows = _of_model(results.item_scores, model)
     read = _of_model(results.sentences, model)
-    if subject != MODEL or not len(read):
+    if subject not in (MODEL, RIVAL) or not len(read):
         return None
     read = read.loc[read["prompt"] == STANDARD]
     read = read.assign(sentence=read["abstention"].astype(float) - read["own"].astype(float))
@@ -131,7 +154,7 @@ def _sentences(results: Results, model: str, subject: str) -> float | None:
     for _, part in rows.groupby("dataset", observed=True):
         void = (part["side"] == "void").to_numpy()
         states, sentence = (float(auroc(void, part[name].to_numpy(float))) for name in ("others", "sentence"))
-        areas.append(states - sentence)
+        areas.append(sentence if subject == RIVAL else states - sentence)
     return _mean(areas)
 
 
@@ -162,13 +185,11 @@ def _gate(results: Results, model: str, subject: str) -> float | None:
     rows = _of_model(results.gate, model)
     rows = rows.loc[(rows["regime"] == STANDARD) & (rows["source"] == "other datasets") & (rows["threshold"] == "mid")]
     pecs = rows.loc[rows["target"] == "all"].set_index("features")["pecs"].astype(float).to_dict()
-    return _above_others(pecs, subject)
-
-
-def _above_others(metrics: dict[Any, float], subject: str) -> float | None:
-    own = metrics.get({MODEL: STATES}.get(subject, subject))
-    others = [metrics[name] for name in OTHER_GATES if name in metrics]
-    return None if own is None or not others else own - max(others)
+    own = pecs.get({MODEL: STATES}.get(subject, subject))
+    others = max((pecs[name] for name in OTHER_GATES if name in pecs), default=None)
+    if subject == RIVAL or own is None or others is None:
+        return others if subject == RIVAL else None
+    return own - others
 
 
 def _of_own(metric: Callable[[Results, str], float | None]) -> Callable[[Results, str, str], float | None]:
@@ -234,49 +255,52 @@ def _interaction(results: Results, model: str, subject: str) -> float | None:
     return None if subject == PLACEBO or rows.empty else float(metrics.max())
 
 
-_ALL, _GAP = (*RANDOM, PLACEBO, NO_GAP), (*RANDOM, PLACEBO)
-_SUBTRACTED = {RIVAL: "subtracted"}
-_TEXTS = {**_SUBTRACTED, PLACEBO: "same clip"}  # an ill-posed question is asked of the control's clip
-_PROBES = {RIVAL: "in leads", PLACEBO: "look-alikes"}
-_ANSWERS = {**dict.fromkeys(RANDOM, "not asked"), PLACEBO: "not asked", RIVAL: "no probe"}
+_GAP = (NO_GAP,)
+_SIDES = ("n_voids", "n_controls")
+_VISUAL, _TEXTUAL, _ITEMS = ("leads", _SIDES, VISUAL), ("leads", _SIDES, TEXTUAL), ("lens", _SIDES, DATASETS)
 CLAIMS = (
-    Claim("interaction", "states tell, and rivals do not, that the asked event is hidden",
-          "AUROC and share in a clip, the lower", 0.65, _interaction, (*RANDOM, RIVAL), {PLACEBO: "same clip"}),
+    Claim("interaction", "states alone tell whether the asked event is hidden",
+          "AUROC, or share of clips if lower,", 0.65, _interaction, (*RANDOM, RIVAL),
+          ("interaction", ("n_clips",), ())),
     Claim("lead_visual", "states tell visual voids better than all rivals", "AUROC, states − best rival", 0.1,
-          _by_features(_lead, VISUAL), _GAP, _SUBTRACTED),
+          _by_features(STATES, _best_rival, VISUAL), (*RANDOM, PLACEBO), _VISUAL),
     Claim("lead_textual", "states tell ill-posed voids better than all rivals", "AUROC, states − best rival", 0.1,
-          _by_features(_lead, TEXTUAL), _GAP, _TEXTS),
-    Claim("residual", "states without words, pixels, length tell visual voids", "AUROC of residual states", 0.65,
-          _by_features(lambda results, target, areas: areas[RESIDUAL], VISUAL), _GAP, {RIVAL: "taken out"}),
-    Claim("output", "states tell visual voids better than the output", "AUROC, states − best of the output", 0.1,
-          _by_features(_beyond_output, VISUAL), _ALL, _SUBTRACTED),
-    Claim("sentence", "states tell voids better than a whole abstention", "AUROC, states − sentence", 0.1, _sentences,
-          (NO_GAP,), _ANSWERS | _SUBTRACTED),
-    Claim("unexpressed", "voids are encoded and answered", "share of voids − of controls", 0.3, _unexpressed,
-          (NO_GAP,), _ANSWERS),
-    Claim("transfer_visual", "one probe carries over to visual voids", "AUROC at the chosen layer", 0.65,
-          _transfer(VISUAL), RANDOM, _PROBES),
-    Claim("transfer_textual", "one probe carries over to ill-posed questions", "AUROC at the chosen layer", 0.65,
-          _transfer(TEXTUAL), RANDOM, _PROBES),
-    Claim("look_alikes", "voids differ from all that looks like them", "lowest AUROC", 0.65, _look_alikes, RANDOM,
-          _PROBES | {PLACEBO: "included"}),
-    Claim("gate", "a gate on states beats all other gates", "PECS, states − best other", 0.05, _gate,
-          (*RANDOM, NO_GAP), {PLACEBO: "not asked"} | _SUBTRACTED),
-    Claim("answers", "abstains on voids when told that it may", "AbsRec, guided − standard", 0.3,
-          _prompt(lambda rows: rows["change"]), (NO_GAP,), _ANSWERS),
-    Claim("lens", "the prompt decides what is said of voids", "guided moves voids, nats", 1.0, _of_own(_moved),
-          (NO_GAP,), _ANSWERS),
-    Claim("prompt", "the prompt changes the output’s order alone", "change of AUROC, margin − probe", 0.1,
+          _by_features(STATES, _best_rival, TEXTUAL), RANDOM, _TEXTUAL),
+    Claim("residual", "states without words, pixels, length tell visual voids", "AUROC of what is left of states",
+          0.65, _by_features(RESIDUAL, None, VISUAL), (*RANDOM, PLACEBO), _VISUAL),
+    Claim("output", "states tell visual voids better than the output does", "AUROC, states − output", 0.1,
+          _by_features(STATES, _output, VISUAL), (*RANDOM, PLACEBO, NO_GAP), _VISUAL),
+    Claim("sentence", "states tell voids better than an abstention’s likelihood", "AUROC, states − likelihood", 0.1,
+          _sentences, _GAP, _ITEMS),
+    Claim("unexpressed", "states tell a void, and the model answers all the same",
+          "share of voids − share of controls", 0.3, _unexpressed, _GAP, _ITEMS),
+    Claim("transfer_visual", "a probe of other datasets tells visual voids", "AUROC", 0.65, _transfer(VISUAL), RANDOM,
+          ("prompted_probes", _SIDES, VISUAL)),
+    Claim("transfer_textual", "a probe of other datasets tells ill-posed voids", "AUROC", 0.65, _transfer(TEXTUAL),
+          RANDOM, ("prompted_probes", _SIDES, TEXTUAL)),
+    Claim("look_alikes", "states tell voids from all answerable look-alikes", "AUROC, the lowest", 0.65, _look_alikes,
+          RANDOM, ("prompted_probes", _SIDES, (*LOOK_ALIKES,))),
+    Claim("gate", "abstaining by states scores higher than by any rival", "benchmark score (PECS), states − best rival",
+          0.05, _gate, (*RANDOM, NO_GAP), ("gate", _SIDES, ("all",))),
+    Claim("answers", "the model abstains on voids when told that it may",
+          "share of voids abstained on, guided − standard", 0.3,
+          _prompt(lambda rows: rows["change"]), _GAP, ("gate", ("n_voids",), ("all",))),
+    Claim("lens", "the guided prompt raises abstention on voids alone",
+          "log-odds (nats), voids − controls, guided − standard", 1.0,
+          _of_own(_moved), _GAP, _ITEMS),
+    Claim("prompt", "the prompt changes what the output tells, not states",
+          "change of AUROC, output − states", 0.1,
           _prompt(lambda rows: rows["margin_guided"] - rows["margin_standard"]
-                  - (rows["probe_guided"] - rows["probe_standard"]).abs(), joins=False), (NO_GAP,), _ANSWERS),
-    Claim("differ", "output depends on the side (patching)", "share of pairs that differ in sign", 0.5,
-          _of_own(_differ), (NO_GAP,), _ANSWERS),
-    Claim("direction", "one direction of the void under both prompts", "cosine standard, guided", 0.65,
-          _of_own(_same_direction), (NO_GAP,), _ANSWERS),
-    Claim("followed", "answers follow what guided states hold alone", "controls, guided − standard directions", 0.3,
-          _of_own(_followed), (NO_GAP,), _ANSWERS),
-    Claim("ahead", "guided directions do more than nulls", "controls, direction − highest null draw, largest α", 0.1,
-          _of_own(_ahead), (), _ANSWERS),
+                  - (rows["probe_guided"] - rows["probe_standard"]).abs(), joins=False), _GAP, _ITEMS),
+    Claim("differ", "the output leans to abstention on one side of a pair alone", "share of pairs", 0.5,
+          _of_own(_differ), _GAP, ("patching", ("n",), ())),
+    Claim("direction", "states tell voids along one direction under both prompts", "cosine, standard and guided", 0.65,
+          _of_own(_same_direction), _GAP),
+    Claim("followed", "steered along guided states, not standard, it abstains",
+          "share of controls abstained on, guided − standard", 0.3, _of_own(_followed), _GAP),
+    Claim("ahead", "steering along guided states beats random directions",
+          "share of controls abstained on, guided − highest random", 0.1, _of_own(_ahead), (),
+          ("nulls", ("n",), ("all",))),
 )  # fmt: skip
 
 # --- verdicts ---------------------------------------------------------------------------------------------------------
@@ -298,16 +322,16 @@ def claim_frame(results: Results) -> pd.DataFrame:
                     values[subject], note = None, f"two models ({joined})"
             metrics = {f"in_{subject}": value for subject, value in values.items()}
             words = {f"why_{subject}": _absence(claim, subject, value) for subject, value in values.items()}
-            row = {"model": model, "claim": claim.name, **metrics, **words}
+            row = {"model": model, "claim": claim.name, "n": claim.n(results, model), **metrics, **words}
             rows.append(row | {"verdict": note or verdict(claim, values)})
     fields = (f"{kind}_{subject}" for kind in ("in", "why") for subject in SUBJECTS)
-    return pd.DataFrame(rows, columns=pd.Index(["model", "claim", *fields, "verdict"]))
+    return pd.DataFrame(rows, columns=pd.Index(["model", "claim", "n", *fields, "verdict"]))
 
 
 def _absence(claim: Claim, subject: str, value: float | None) -> str:
     """Return why a subject has no metric of a claim, in words for a cell; empty if it has one."""
     if value is None:
-        return claim.instead.get(subject, "not run")
+        return "not run" if subject == MODEL or subject in claim.fails_in else NONE
     return "" if value == value else "constant"
 
 
@@ -316,7 +340,7 @@ def verdict(claim: Claim, values: Mapping[str, float | None]) -> str:
     known = {name: value for name, value in values.items() if value is not None and value == value}
     own = known.get(MODEL)
     if own is None or own < claim.bound:
-        return "not measured" if own is None else "does not hold"
+        return "not measured" if own is None else "model below bound"
     controls = {name: known[name] for name in claim.fails_in if name in known}
     failing = [SUBJECT_NAMES[name] for name, value in controls.items() if value >= claim.bound]
     if failing:
@@ -346,11 +370,11 @@ def _claims(results: Results) -> PrintedTable:
     by_name = {claim.name: claim for claim in CLAIMS}
     rows = rows.assign(
         says=[by_name[name].says for name in rows["claim"]],
-        metric=[f"{by_name[name].metric} ≥ {by_name[name].bound:g}" for name in rows["claim"]],
+        metric=[by_name[name].holds_if for name in rows["claim"]],
         **{f"cell_{name}": claim_cells(rows, name) for name in SUBJECTS},
     ).drop(columns=[f"why_{name}" for name in SUBJECTS])
     columns = [
-        MODEL_COLUMN, Column("says", "Claim"), Column("metric", "Holds if"),
+        MODEL_COLUMN, Column("says", "Claim"), Column("metric", "Holds if"), Column("n", "n", "count"),
         *(Column(f"cell_{name}", SUBJECT_NAMES[name], "range") for name in SUBJECTS), Column("verdict", "Verdict"),
     ]  # fmt: skip
     notes = [
@@ -359,8 +383,8 @@ def _claims(results: Results) -> PrintedTable:
         "random: the same network with random weights, two seeds, under the same prompt; placebo: answerable items in "
         "the place of voids, the largest metric; pocket, no gap: a model that says all that it encodes, the largest "
         "metric of its seeds",
-        "words for numbers: same clip, both questions are of one, so that no placebo differs; subtracted, the "
-        "metric is a difference from it; not asked, it gave no answers; constant, its states are one for all items",
+        f"{NONE}: the claim has no such control; constant: its states are one for all items; n: items, of patching "
+        "pairs, of two events clips; best rival: what the lead of the model is over",
         "probes are fitted on other datasets; rivals: words, pixels, length, time stamps, the output margin, and a "
         "probe on the logits of the first token",
     ]
