@@ -73,7 +73,6 @@ def test_a_site_says_what_it_holds(small: Checkout, tmp_path: Path) -> None:
     assert (site["answers"], site["clips"]) == (288, 0) and site["folder"] == str(tmp_path / "site")
 
 
-def test_findings_and_differences_are_rows(small: Checkout) -> None:
-    assert {"statement", "published", "recomputed", "verdict"} <= {*read(small, "results", "audit")[0]}
+def test_differences_are_rows(small: Checkout) -> None:
     difference = read(small, "results", "compare", str(small.workspace))[0]
     assert difference["difference"] == 0.0

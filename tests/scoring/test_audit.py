@@ -8,7 +8,6 @@ import pytest
 from tools.paper_audit.arranged import arranged
 from tools.paper_audit.claims import CLAIMS
 from tools.paper_audit.recomputed import recomputed
-from traps_pipeline.cli import main
 from traps_pipeline.scoring.audit import audit, counts_text
 from traps_pipeline.scoring.published import PUBLISHED, as_printed, published
 
@@ -84,13 +83,3 @@ def test_the_cell_behind_it_is_the_only_one_whose_factors_do_not_give_its_pecs(f
     assert list(factors["statement"]) == ["PECS of llava-next-video-7b, chaotic, json"]
     # With Acc x J of its factors in its place the overall metric is the printed one.
     assert round((0.013 + 0.013 + 0.244 * (0.098 - 0.021) + 0.056) / 4, 3) == 0.025
-
-
-def test_the_command_prints_claims_and_discrepancies_and_writes_all_findings(tmp_path, capsys):
-    assert main(["results", "audit", "--csv", str(tmp_path / "audit.csv")]) == 0
-    printed = capsys.readouterr().out
-    assert "agrees          steer-family" in printed
-    assert "differs         nine-contour" in printed and "(line 1907)" in printed
-    assert "1 differs" in printed
-    assert "overall acc of gemini-2.5-pro" not in printed
-    assert "overall acc of gemini-2.5-pro" in (tmp_path / "audit.csv").read_text()

@@ -12,10 +12,10 @@ from traps_pipeline.scenes.certification.certificates import EARLIEST_CUT_S, set
 from traps_pipeline.scenes.draw.closing import moments, occluder_from
 from traps_pipeline.scenes.parts.look import draw_look
 from traps_pipeline.scenes.parts.wording import draw_ill_posed
-from traps_pipeline.scenes.physics.kit import Family, Wording
+from traps_pipeline.scenes.physics.kit import Family, View, Wording
 from traps_pipeline.scenes.physics.simulate import replay
 from traps_pipeline.scenes.picture import checks
-from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Closing, View, fit_camera, fit_shot, is_in_frame
+from traps_pipeline.scenes.picture.camera import HEIGHT, WIDTH, Closing, fit_camera, fit_shot, is_in_frame
 from traps_pipeline.scenes.picture.render import Renderer
 from traps_pipeline.scenes.worlds.outcome import Outcome, Rejected, compile_scene, decisive_geoms, simulated
 from traps_pipeline.scenes.worlds.pace import lengths, shortened

@@ -38,7 +38,7 @@ from traps_pipeline.cli.command import FAILED, INTERRUPTED, OK, SHORT_NAMES, Com
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GROUPS = {
     "study": "plan, run and look after a study",
-    "results": "explore, export, compare and audit results",
+    "results": "explore, export and compare results",
     "benchmark": "sample, certify and commit to a benchmark",
     "models": "check models, judges and panels",
     "people": "review scenarios, label clips and answers",

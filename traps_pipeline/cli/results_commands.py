@@ -1,7 +1,6 @@
-"""Write, audit and compare results, with the explorer (`traps results`)."""
+"""Write and compare results, with the explorer (`traps results`)."""
 
 import argparse
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,6 @@ def add(commands: Commands) -> None:
     parser = commands.add("results site", site, text, example="site --without-clips", json=True)
     parser.add_argument("folder", nargs="?", type=Path, help="default: `site` in the study's folder")
     parser.add_argument("--without-clips", action="store_true", help="leave the clips out, for a small folder")
-
-    text = "recompute published values from other published tables, and compare"
-    parser = commands.add("results audit", audit_published, text, example="--all", workspace=False, json=True)
-    parser.add_argument("--all", action="store_true", help="also show the statements that agree")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write every finding to a file")
 
     text = "write every table, figure and page to one file, or to a folder"
     parser = commands.add("results export", export_results, text, example="results.zip")
@@ -57,21 +51,6 @@ def site(arguments: argparse.Namespace) -> int:
 
 def _megabytes(size: int) -> str:
     return f"{size / 1e6:.1f} MB"
-
-
-def audit_published(arguments: argparse.Namespace) -> int:
-    """Print what the paper's tables contradict; a discrepancy is a finding and fails nothing."""
-    from traps_pipeline.scoring.audit import audit, audit_text
-
-    findings = audit()
-    if arguments.json:
-        print_json(findings)
-    else:
-        print(wrap_text(audit_text(findings, arguments.all)))
-    if arguments.csv:
-        arguments.csv.write_bytes(csv_bytes(findings))
-        print(f"every finding: {arguments.csv}", file=sys.stderr)
-    return OK
 
 
 def export_results(arguments: argparse.Namespace) -> int:

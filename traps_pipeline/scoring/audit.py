@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from traps_pipeline.base.wording import count_noun
 from traps_pipeline.scoring.published import as_printed
 
 if TYPE_CHECKING:
@@ -22,22 +21,6 @@ _AGREEING = (AGREES, ROUNDING)
 def audit() -> pd.DataFrame:
     """Return a frame with a row per statement of the paper: group, published, recomputed and other texts."""
     return as_printed("audit")
-
-
-def audit_text(findings: pd.DataFrame, everything: bool = False) -> str:
-    """Return the claims, differences and counts as text. everything: list the other statements, too."""
-    lines = ["lines are those of the paper's LaTeX source"]
-    for group, rows in findings.groupby("group", sort=False):
-        counts = ", ".join(f"{n} {verdict}" for verdict, n in rows["verdict"].value_counts().items())
-        lines.append(f"{group}: {count_noun(len(rows), 'statement')}: {counts}")
-        listed_rows = rows if everything or group == "claims" else rows.loc[rows["verdict"].isin([DIFFERS, DECLARED])]
-        for row in listed_rows.to_dict("records"):
-            line_note = f" (line {row['line']})" if row["line"] else ""
-            lines.append(f"  {row['verdict']:<15} {row['statement']}{line_note}")
-            lines.append(f"  {'':<15} published {row['published']}; recomputed {row['recomputed']}")
-            lines += [f"  {'':<15} {row['reason']}"] if row["reason"] else []
-    lines.append(counts_text(findings))
-    return "\n".join(lines)
 
 
 def counts_text(findings: pd.DataFrame) -> str:
