@@ -195,7 +195,7 @@ class CircuitBreaker:
             "command again: only what is missing is asked"
         )
         for stops in _stopped:
-            stops.setdefault(self._participant, message)  # calls in flight return later, and raise too
+            message = stops.setdefault(self._participant, message)  # calls in flight return later, and raise it, too
         raise ParticipantStopped(message)
 
 
