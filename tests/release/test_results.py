@@ -54,7 +54,7 @@ def test_results_of_a_held_out_set_count_the_items_that_it_asks(small: Checkout,
     study.traps("publish", "results", folder, "--dataset", "owner/traps").ok()
     records = [json.loads(path.read_text()) for path in (folder / "data").rglob("*.json")]
     counts = {one["source_data"]["samples_number"] for record in records for one in record["evaluation_results"]}
-    assert counts == {asked["item_id"].nunique()} == {verdicts["item_id"].nunique() // 2}
+    assert counts == {len({*asked["item_id"]})} == {len({*verdicts["item_id"]}) // 2}
 
 
 def test_the_hubs_library_reads_the_results(written: Path) -> None:
