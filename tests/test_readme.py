@@ -70,7 +70,7 @@ def test_the_commands_of_the_readme_that_render_nothing_run_on_the_golden_study(
     (experiment,) = blocks("yaml")
     (study.workspace.parent / "mine.yaml").write_text(experiment)
     commands = [line for line in "".join(blocks("sh")).splitlines() if not DEAR.match(line)]
-    assert len(commands) == 10
+    assert len(commands) == 9
     for command in commands:
         ours = re.sub(r"\b(status|plan) demo$", rf"\1 {EXPERIMENT}", command)
         finished = run(study, in_this_study(study, ours))

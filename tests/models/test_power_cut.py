@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.build.asking import TEN, Answering, ask, kept
-from traps_pipeline.models.asking import ask as asking
+from traps_pipeline.models.asking import workers
 from traps_pipeline.models.request import Outcome, Request
 
 OnDisk = Callable[[], list[str]]
@@ -48,7 +48,7 @@ def test_no_answer_of_a_finished_cell_is_lost(study: Path, on_disk: OnDisk) -> N
 def test_while_a_call_is_out_the_answers_that_came_before_are_safe(
     study: Path, on_disk: OnDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(asking, "SYNC_S", 0.01)
+    monkeypatch.setattr(workers, "SYNC_S", 0.01)
     safe = list[int]()
 
     class LastIsOut(Answering):

@@ -5,7 +5,9 @@ time. No kill of a process loses an event. A power cut may damage the history, w
 footers are authoritative (`dagster_history`). The ledger has files of its own, and waits.
 """
 
+from contextlib import suppress
 from pathlib import Path
+from sqlite3 import DatabaseError
 from typing import Any
 
 from sqlalchemy import Connection, Engine, ExceptionContext
@@ -26,7 +28,8 @@ def _is_history(engine: Engine) -> bool:
 def _do_not_sync(connection: Connection) -> None:
     driver: Any = connection.connection.driver_connection
     if _is_history(connection.engine):
-        driver.execute("PRAGMA synchronous=OFF")
+        with suppress(DatabaseError):  # of a file that is no database, which the next statement names
+            driver.execute("PRAGMA synchronous=OFF")
 
 
 @listens_for(Engine, "handle_error")
