@@ -29,6 +29,11 @@ def test_a_number_that_is_none_is_bad_usage(arguments: list[str], capsys: pytest
     assert f"argument {arguments[-2]}: " in capsys.readouterr().err
 
 
+def test_no_pairs_are_a_sample_only_beside_two_events(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*SAMPLE, "--count", "0", "--out", str(tmp_path / "sampled")]) == 1
+    assert "--count: 0 pairs" in capsys.readouterr().err and not (tmp_path / "sampled").exists()
+
+
 @pytest.mark.parametrize("said", ["nan", "inf", "-1", "1e3", "1_000", "", "yes", "gpt-5=nan", "=", "\u0661"])
 def test_a_budget_that_is_no_number_is_named(said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "demo", "--workspace", str(tmp_path / "w"), f"--budget-usd={said}"]) == 1

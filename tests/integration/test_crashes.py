@@ -73,6 +73,7 @@ def test_a_history_that_cannot_be_written_in_mid_evaluation_ends_the_run_and_los
         database.execute("DROP TRIGGER full")
         database.commit()
     assert rows_written(unasked, "answers") > 0  # cells are asked ahead of their events: of these few all may be
+    assert rows_written(unasked, "votes") == 0  # the run ended in the stage whose event was lost
     unasked.score(ONE_REGIME).ok()
     keys = [row["key"] for row in unasked.ledger_rows("answers")]
     assert len(keys) == len(set(keys)) == ANSWERS
